@@ -101,3 +101,37 @@ def test_auto_and_compare_say_why_they_differ() -> None:
     assert "obsynth compare ranks by errors over a scenario instead" in chosen.notes[0]
     alone = obsynth.compare(plant, methods=[chosen.method], runs=5)
     assert "auto" not in alone.advice
+
+
+def hover() -> obsynth.DescriptorSystem:
+    """Return a multicopter of 0.6 kg about hover, whose rotors follow within 50 ms, sampled at 50 Hz."""
+    mass, drag, lag = 0.6, 0.1, 0.05
+    plant = obsynth.DescriptorSystem(
+        None, [[0, 1, 0], [0, -drag / mass, 1 / mass], [0, 0, -1 / lag]], [[0], [0], [1 / lag]],
+        [[1, 0, 0], [0, 1, 0]], Bf=[[0], [1 / mass], [0]], fault_names=["lift"],
+    )  # fmt: skip
+    return obsynth.discretise(plant, 0.02).plant
+
+
+def test_an_estimate_that_noise_drowns_is_not_taken_because_it_is_fast() -> None:
+    """The weight is 5.9 N: an estimate of the lift with a deviation of 11 N says nothing."""
+    plant = hover().replace(Bw=np.zeros((3, 2)), Dw=np.diag([0.02, 0.3]), noise_names=None)
+    design = obsynth.design(plant)
+    (found,) = fault_figures(plant, design.observer, 400)
+    assert found.deviation < 0.6, design.notes[0]
+
+
+def test_a_scenario_says_the_noise_and_how_large_faults_are() -> None:
+    scenario = obsynth.Scenario(
+        horizon=10.0, faults={"lift": obsynth.Step(size=0.6, start=5.0)}, sensor_noise={"y1": 0.02, "y2": 0.3}
+    )
+    plant = hover()
+    design = obsynth.design(plant, scenario=scenario)
+    (found,) = fault_figures(
+        plant.replace(Bw=np.zeros((3, 2)), Dw=np.diag([0.02, 0.3]), noise_names=None), design.observer, 400
+    )
+    assert 2.0 * found.deviation < 0.6, design.notes[0]
+    assert "its noise hides lift of the scenario" in design.notes[0]
+    # Beside a scenario of another plant the choice is as without one.
+    other = obsynth.Scenario(horizon=1.0, faults={"nobody": obsynth.Step(size=1.0)})
+    assert obsynth.design(plant, scenario=other).method == obsynth.design(plant).method

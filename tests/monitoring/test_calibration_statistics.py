@@ -177,7 +177,7 @@ def test_a_regressor_counts_beside_others() -> None:
 def test_correlations_are_sought_between_a_third_of_a_sample_and_the_length_of_the_log() -> None:
     inner = SimpleNamespace(
         values={}, state_names=("x",), equation_names=("x",), unstated=set(), units={}, has_levels=False, notes=(),
-        unknown_inputs=(), nominal_signals=np.zeros(0), nominal_state=np.zeros(1), state_scales=np.ones(1),
+        unknown_inputs=(), walking=(), nominal_signals=np.zeros(0), nominal_state=np.zeros(1), state_scales=np.ones(1),
         state_deviations=np.ones(1), own_integration="radau",
     )  # fmt: skip
     log = SimpleNamespace(output_names=("y",), dt=0.1, samples=400, y=np.random.default_rng(0).normal(size=(400, 1)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -22,6 +22,8 @@ from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.signals import resolve
 
 #: Peak gain from an unknown input to a fault estimate, in fault per input, above which it is not decoupled.
 DECOUPLED = 1e-3
@@ -30,8 +32,12 @@ DECOUPLED = 1e-3
 SETTLING_SAMPLES = 200
 
 
-#: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
-SLOW_ESTIMATE = 0.25
+#: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones,
+#: unless its noise times the root of its delay is so many times less.
+SLOW_ESTIMATE, SLOW_GAIN = 0.25, 10.0
+
+#: Deviations of an estimate that a fault of a scenario must be at least, so that noise does not hide it.
+SEEN_DEVIATIONS = 2.0
 
 
 #: The condition that a refusal names, and what stands between it and what was found.
@@ -49,6 +55,37 @@ Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
 
 
 @dataclass(frozen=True, eq=False)
+class Expected:
+    """What a scenario says of a plant on a clock: the plant with the scenario's noise, and sizes of faults by name."""
+
+    plant: DescriptorSystem
+    sizes: Mapping[str, float]
+
+
+def expected_of(sampled: DescriptorSystem, scenario: Scenario | None) -> Expected | None:
+    """Return what a scenario says of a sampled plant; nothing where there is none that fits it."""
+    if scenario is None:
+        return None
+    try:
+        signals = resolve(sampled, scenario.replace(sample_time=None))
+    except ObsynthError:
+        # A scenario that is none of this plant is refused where it is simulated.
+        return None
+    first = sampled.nu
+    largest = np.abs(signals.left[:, first : first + sampled.nf]).max(axis=0)
+    sizes = {name: float(size) for name, size in zip(sampled.fault_names, largest, strict=True) if size > 0.0}
+    factor, deviations = scenario.noise or 1.0, np.array(signals.deviations)
+    plant = sampled
+    if factor != 1.0 or deviations.any():
+        plant = sampled.replace(
+            Bw=np.hstack([factor * sampled.Bw, np.zeros((sampled.nx, sampled.ny))]),
+            Dw=np.hstack([factor * sampled.Dw, np.diag(deviations)]),
+            noise_names=None,
+        )
+    return Expected(plant, sizes)
+
+
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A method for a plant: its design and figures, or why there is none."""
 
@@ -58,6 +95,16 @@ class Candidate:
     figures: tuple[FaultFigures, ...]  # of each fault
     milliseconds: float  # to design
     refused: str
+    sizes: Mapping[str, float] = field(default_factory=dict)  # of faults, where a scenario states them
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Faults of a scenario that the noise of the estimate hides."""
+        return tuple(
+            figure.fault
+            for figure in self.figures
+            if figure.fault in self.sizes and not self.sizes[figure.fault] >= SEEN_DEVIATIONS * figure.deviation
+        )
 
     def rank(self, has_unknown_inputs: bool, settling: float = np.inf) -> tuple[float, ...]:
         """Return what sorts candidates, best first; ``settling``: the plant's time (s); and whether the plant
@@ -66,12 +113,12 @@ class Candidate:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(fault.reaches for fault in self.figures))
         coupled = float(has_unknown_inputs and any(fault.unknown_input_gain > DECOUPLED for fault in self.figures))
-        slow = float(any(fault.most > SLOW_ESTIMATE * settling for fault in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
         prices = [fault.deviation * np.sqrt(max(fault.most, dt)) for fault in self.figures]
         price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
-        return (missed, coupled, slow, price)
+        slow = any(fault.most > SLOW_ESTIMATE * settling for fault in self.figures)
+        return (missed, coupled, float(len(self.hidden)), price * (SLOW_GAIN if slow else 1.0))
 
 
 def candidate(
@@ -83,8 +130,10 @@ def candidate(
     options: Mapping[str, Any],
     *,
     continuous: bool = False,
+    expected: Expected | None = None,
 ) -> Candidate:
-    """Return one method for a plant; on the sampled plant where it can be, or else (or if asked) sampled afterwards."""
+    """Return one method for a plant; on the sampled plant where it can be, or else (or if asked) sampled afterwards;
+    with figures of what is expected of the plant."""
     known = method_class(method)
     if "time-invariant" not in known.plants:
         return _refused(method, "for nonlinear plants")
@@ -99,7 +148,8 @@ def candidate(
     if not observer.fault_names or any(name not in sampled.fault_names for name in observer.fault_names):
         why = "estimates the state, but no fault" if observer.state_names else "detects faults, but estimates none"
         return _refused(method, why, spent)
-    return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
+    judged, sizes = (sampled, {}) if expected is None else (expected.plant, expected.sizes)
+    return Candidate(method, made, observer, fault_figures(judged, observer, steps), spent, "", sizes)
 
 
 def _sampled(design: ObserverDesign, dt: float) -> LinearObserver:
@@ -142,8 +192,11 @@ def _methods_with(purpose: Purpose, among: Iterable[str]) -> list[str]:
     return [method for method in among if purpose in method_class(method).purposes]
 
 
-def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker) -> ObserverDesign:
-    """Return the design of the method chosen; ``maker(plant, method, options)``; ``refusing`` says what would help."""
+def automatic_design(
+    plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker, scenario: Scenario | None = None
+) -> ObserverDesign:
+    """Return the design of the method chosen; ``maker(plant, method, options)``; ``refusing`` says what would help; a
+    ``scenario`` says the noise and how large faults are."""
     if not isinstance(plant, DescriptorSystem):
         purpose: Purpose = "parameters" if plant.parameter_names else "state despite noise"
         known = methods_for(kind_of(plant))
@@ -167,13 +220,18 @@ def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refus
         if refusals:
             raise refusals[0]
         raise SpecError("The plant has no faults, and the options are for methods that estimate some.", path="method")
-    return _chosen(plant, options, possible, maker, refusing)
+    return _chosen(plant, options, possible, maker, refusing, scenario)
 
 
 def _chosen(
-    plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker, refusing: Maker
+    plant: DescriptorSystem,
+    options: Mapping[str, Any],
+    possible: list[str],
+    maker: Maker,
+    refusing: Maker,
+    scenario: Scenario | None,
 ) -> ObserverDesign:
-    candidates = [entry for entry in designed(plant, options, possible, maker) if entry.design is not None]
+    candidates = [entry for entry in designed(plant, options, possible, maker, scenario) if entry.design is not None]
     if not candidates:
         # What forbids the one that needs least forbids the fault.
         purposes: tuple[Purpose, ...] = ("faults under the weakest conditions", "faults")
@@ -186,22 +244,32 @@ def _chosen(
     return _with_note(best.design, reason(best, ranked_below, plant))
 
 
-def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[str], maker: Maker) -> list[Candidate]:
-    """Return every method for a plant in its own time, with figures on one clock."""
-    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SETTLING_SAMPLES
+def designed(
+    plant: DescriptorSystem,
+    options: Mapping[str, Any],
+    methods: list[str],
+    maker: Maker,
+    scenario: Scenario | None = None,
+) -> list[Candidate]:
+    """Return every method for a plant in its own time, with figures on one clock: its own, or that of a scenario."""
+    stated = None if scenario is None else scenario.sample_time
+    step = plant.dt if plant.dt > 0.0 else stated or settling_time(plant) / SETTLING_SAMPLES
     steps = int(min(max(SETTLING_TIMES * settling_time(plant) / step, 50), MOST_FIGURE_SAMPLES))
     try:
         sampled = on_the_clock(plant, step)
     except ObsynthError:
         # Not of index one: only methods that need no elimination are left, and nothing to compare on.
         return []
-    own_time = plant.dt == 0.0
+    own_time, expected = plant.dt == 0.0, expected_of(sampled, scenario)
     fitting = [
         method
         for method in _methods_with("faults", methods)
         if not (plant.dt > 0.0 and method_class(method).time == "continuous")
     ]
-    return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in fitting]
+    return [
+        candidate(method, plant, sampled, steps, maker, options, continuous=own_time, expected=expected)
+        for method in fitting
+    ]
 
 
 def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem) -> str:
@@ -215,7 +283,14 @@ def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSyst
     deviation = ", ".join(f"{fault.deviation:.3g}" for fault in best.figures)
     delay = ", ".join(f"{fault.most:.3g}" for fault in best.figures)
     words.append(f"90 % of a step after {delay} s, with a deviation of {deviation}")
-    below = ", ".join(other.method for other in ranked_below)
+    below = ", ".join(
+        f"{other.method} (its noise hides {' and '.join(other.hidden)} of the scenario)"
+        if other.hidden and not best.hidden
+        else other.method
+        for other in ranked_below
+    )
+    if best.hidden:
+        words.append(f"its noise hides {' and '.join(best.hidden)} of the scenario")
     return f"{'; '.join(words)}; ranked below it: {below}; obsynth compare ranks by errors over a scenario instead"
 
 

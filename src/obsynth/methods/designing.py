@@ -71,7 +71,8 @@ def design(
     progress : callable, optional
         Called with a text at the start of each stage.
     scenario : Scenario, optional
-        What the plant is expected to do, for guaranteed tests of plants with tolerances.
+        What the plant is expected to do: for guaranteed tests of plants with tolerances, and for ``auto``, which takes
+        noise, sample time and sizes of faults from it.
     **options
         Options of the method.
 
@@ -133,7 +134,7 @@ def design(
         with failed_computations(), one_thread_if_small(own.nx):
             working = working_plant(own, recovery, report_stage, None)
             own, recovery = working.plant, working.recovery
-            chosen = automatic_design(own, options, made, partial(made, advise=True))
+            chosen = automatic_design(own, options, made, partial(made, advise=True), scenario)
             return chosen.replace(notes=(*working.notes, *chosen.notes)) if working.reduced else chosen
     return made(own, method, options, advise=True)
 

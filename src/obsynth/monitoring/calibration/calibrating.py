@@ -13,8 +13,10 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out, wrong_samples
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
+from obsynth.monitoring.calibration.likelihood import Likelihood
 from obsynth.monitoring.calibration.linear_plant import LinearPlant
 from obsynth.monitoring.calibration.logs import LogData, RecordedLog, read_log, told_rows
+from obsynth.monitoring.calibration.long_logs import is_long, searched_rows
 from obsynth.monitoring.calibration.noise_proposals import like_problem, proposed_states
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states
 from obsynth.monitoring.calibration.plants import CalibrationPlant, NonlinearPlant
@@ -254,14 +256,17 @@ def calibrate(
         plant, problem_with, starts, seed, level, note, integration == "auto", initial_covariance is None, innovations
     )
     search = innovations and input_delay == "auto" and bool(model.input_names)
+    part = searched_rows(record) if innovations else record
     fitted, noise_model, sentences = fitting.first_fit(
-        noise_model, record, search=search, may_take_offsets=offset is None
+        noise_model, part, search=search, may_take_offsets=offset is None
     )
     fitted = fitting.without_outliers(fitted)
     kinds = (("coloured", sensor_noise), ("offset", offset), ("walk", walks))
     open_kinds = tuple(kind for kind, stated in kinds if stated is None)
     if fitted.fit is not None and open_kinds:
         fitted = fitting.with_proposals(fitted, fitted.fit, noise_model, open_kinds, sentences)
+    if part is not record and fitted.fit is not None:
+        fitted = fitting.on_whole(fitted, fitted.fit, record)
     if offset is None:
         fitted = fitting.with_unseen_offsets(fitted)
     return reported(
@@ -387,6 +392,22 @@ class _Fitting:
         problem = again.problem.with_notes(*before, *sentences)
         return self.without_outliers(replace(again, problem=problem, losses=fitted.losses))
 
+    def on_whole(self, fitted: _FittedProblem, fit: InnovationsFit, log: RecordedLog) -> _FittedProblem:
+        """Return the fit of the whole log, which begins at that of its first rows."""
+        delay = fitted.problem.log.input_delay - log.input_delay
+        problem = fitted.problem.with_whole_log(log.shifted(delay) if delay else log)
+        for _ in range(OUTLIER_ROUNDS):
+            whitened, innovations, variances = Likelihood(problem).innovations(fit.v)
+            judged = replace(fit, whitened=whitened, innovations=innovations, variances=variances)
+            kept = _without_standing_out(problem, judged)
+            if kept is None:
+                break
+            problem = problem.with_log(kept)
+        self.note(f"all {log.samples} rows")
+        fits = simulation_fits(problem, 1, self.seed, self.note, start=fit.t)
+        again, _ = innovations_fit(problem, fits, self.level, self.note, known=fit)
+        return replace(fitted, problem=problem, fits=fits, fit=again)
+
     def with_unseen_offsets(self, fitted: _FittedProblem) -> _FittedProblem:
         """Return the fit with boxes that hold beside offsets of sensors which are too small to be seen: the wider of
         those without and with offsets of `UNSEEN_OFFSET` deviations."""
@@ -405,9 +426,9 @@ class _Fitting:
             P0[place, place] = (UNSEEN_OFFSET * spread[problem.output_names.index(name)]) ** 2
         wide = wide.with_start(P0)
         try:
-            again = innovations_fit(
-                wide, simulation_fits(wide, 1, self.seed, self.note, start=fit.t), self.level, self.note
-            )[0]
+            fits = simulation_fits(wide, 1, self.seed, self.note, start=fit.t)
+            many = is_long(problem.log)
+            again, _ = innovations_fit(wide, fits, self.level, self.note, known=fit if many else None, quick_box=many)
         except (PreconditionError, SolverError):
             again = None
         if again is None:
@@ -427,32 +448,39 @@ class _Fitting:
             if fitted.fit is None:
                 break
             problem = fitted.problem
-            alone = standing_out(fitted.fit.whitened)
-            wrong = alone | wrong_runs(problem, fitted.fit)
-            off = np.abs(fitted.fit.innovations).T
-            if not wrong.any():
+            kept = _without_standing_out(problem, fitted.fit)
+            if kept is None:
                 break
             self.note("without samples that stand out")
-            names, log = problem.output_names, problem.log
-            sentences = [
-                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
-                f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
-                for i, name in enumerate(names)
-                if wrong[:, i].any()
-            ]
-            kept = replace(
-                log,
-                y=read_only(np.where(wrong, np.nan, problem.y)),
-                notes=(*log.notes, *sentences),
-                outliers=tuple(
-                    np.concatenate([before, off[i, alone[:, i]]])
-                    for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
-                ),
-            )
             fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=fitted.fit.t)
             again = _innovations(problem.with_log(kept), fits, self.level, self.note, fitted.error)
             fitted = _FittedProblem(again[0], fits, *again[1:], fitted.losses)
         return fitted
+
+
+def _without_standing_out(problem: CalibrationProblem, fit: InnovationsFit) -> RecordedLog | None:
+    """Return the log without samples that stand out from what a fit predicts, with a note for each sensor; `None` where
+    there are none."""
+    alone = standing_out(fit.whitened)
+    wrong = alone | wrong_runs(problem, fit)
+    if not wrong.any():
+        return None
+    off, names, log = np.abs(fit.innovations).T, problem.output_names, problem.log
+    told = [
+        f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
+        f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
+        for i, name in enumerate(names)
+        if wrong[:, i].any()
+    ]
+    return replace(
+        log,
+        y=read_only(np.where(wrong, np.nan, problem.y)),
+        notes=(*log.notes, *told),
+        outliers=tuple(
+            np.concatenate([before, off[i, alone[:, i]]])
+            for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
+        ),
+    )
 
 
 def _innovations(

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.monitoring.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
+from obsynth.monitoring.calibration.intervals import (
+    Information,
+    Side,
+    information,
+    profile_box,
+    quadratic_box,
+    quantile,
+    upper_limit,
+)
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE
 from obsynth.monitoring.calibration.maximum import (
     Maximum,
@@ -115,10 +123,10 @@ def _information_of_constants(objective: Objective, maximum: Maximum) -> Informa
 
 
 def guarded_maximum(
-    objective: Objective, fits: list[Fit], note: Callable[[str], object]
+    objective: Objective, fits: list[Fit], note: Callable[[str], object], known: FloatArray | None = None
 ) -> tuple[Maximum, Information]:
     """Return the greatest likelihood, with variances that the log cannot distinguish from zero kept away from it."""
-    maximum = greatest_likelihood(objective, fits, note)
+    maximum = greatest_likelihood(objective, fits, note, known)
     knowledge = _information_of_constants(objective, maximum)
     if not knowledge.undetermined:
         # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
@@ -147,18 +155,24 @@ def innovations_fit(
     note: Callable[[str], object],
     *,
     exact: CalibrationProblem | None = None,
+    known: InnovationsFit | None = None,
+    quick_box: bool = False,
 ) -> tuple[InnovationsFit | None, float]:
-    """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
+    """Return the fit of the innovations, from fits of the simulation, or near what is ``known`` of it from fewer rows;
+    with a box by deviations where a ``quick_box`` is asked for. With an ``exact`` problem also by how much its
     constants would move; there is no fit where that matters."""
     objective = Objective(problem, fits[0])
-    maximum, knowledge = guarded_maximum(objective, fits, note)
+    maximum, knowledge = guarded_maximum(objective, fits, note, None if known is None else known.v)
     moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, knowledge)
     if moved > TOLERATED_MOVE:
         return None, moved
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, len(problem.names), problem.log.samples, variances)
-    note("boxes by profile likelihood")
-    sides = profile_box(objective, maximum, root, knowledge)
+    if quick_box:
+        sides = quadratic_box(objective, maximum, root, knowledge)
+    else:
+        note("boxes by profile likelihood")
+        sides = profile_box(objective, maximum, root, knowledge, None if known is None else known.sides)
     # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
     Q, R = objective.noise(maximum.likeliest)
     limited, limits = _limits(objective, maximum)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,11 +124,21 @@ class Side:
     is_open: bool
 
 
-def profile_box(objective: Objective, maximum: Maximum, root: float, knowledge: Information) -> list[tuple[Side, Side]]:
-    """Return both ends of each constant's box, in its own units."""
+def profile_box(
+    objective: Objective,
+    maximum: Maximum,
+    root: float,
+    knowledge: Information,
+    of_fewer_rows: Sequence[tuple[Side, Side]] | None = None,
+) -> list[tuple[Side, Side]]:
+    """Return both ends of each constant's box, in its own units. Where boxes ``of_fewer_rows`` are given, constants
+    that a log hardly determines keep these: all rows say no less."""
     box, problem = [], objective.problem
     for i, (name, width) in enumerate(zip(problem.names, problem.widths, strict=False)):
         weak = objective.bent or any(name in direction for direction in knowledge.undetermined)
+        if weak and of_fewer_rows is not None:
+            box.append(of_fewer_rows[i])
+            continue
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         # An open side is the bound that was given, not what a division and a product leave of it.
@@ -139,6 +149,20 @@ def profile_box(objective: Objective, maximum: Maximum, root: float, knowledge: 
         )
         box.append((low, high))
     return box
+
+
+def quadratic_box(
+    objective: Objective, maximum: Maximum, root: float, knowledge: Information
+) -> list[tuple[Side, Side]]:
+    """Return both ends of each constant's box by its deviation, open at a bound: many rows make the likelihood a
+    parabola, and what they do not determine counts as the whole width."""
+    problem, nominal = objective.problem, objective.constants(maximum.z)
+    reach = root * np.sqrt(np.diag(knowledge.covariance))
+    bounds = zip(problem.low.tolist(), problem.high.tolist(), strict=True)
+    return [
+        (Side(max(value - far, low), value - far <= low), Side(min(value + far, high), value + far >= high))
+        for value, far, (low, high) in zip(nominal.tolist(), reach.tolist(), bounds, strict=False)
+    ]
 
 
 def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:

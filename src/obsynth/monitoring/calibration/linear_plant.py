@@ -107,6 +107,7 @@ class LinearPlant(CalibrationPlant):
         self.nx, self.nu, self.ny = len(plant.state_names), plant.nu, plant.ny
         self.effects = tuple(effects)
         self.unstated = frozenset(self.effects)
+        self.walking = tuple(self.effects)
         self.unknown_inputs = self.effects[len(self.effects) - len(getattr(plant, "disturbance_names", ())) :]
         self.values = {**values, **dict.fromkeys(self.effects, 0.0)}
         self.units = {**{name: item.unit or "1" for name, item in constants.items()}, **plant.units}

@@ -120,6 +120,21 @@ class RecordedLog:
         held = None if self.held is None else self.held[places]
         return replace(self, u=read_only(self.u[places]), held=held, input_delay=self.input_delay + rows)
 
+    def first(self, count: int) -> RecordedLog:
+        """Return the first rows."""
+        return self.between(0, count)
+
+    def between(self, first: int, last: int) -> RecordedLog:
+        """Return the rows from one to before another."""
+        return replace(
+            self,
+            time=self.time[first:last],
+            u=self.u[first:last],
+            y=self.y[first:last],
+            rows=(self.rows[0] + first, self.rows[0] + last),
+            held=None if self.held is None else self.held[first:last],
+        )
+
     def without(self, wrong: NDArray[np.bool_]) -> RecordedLog:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
         notes = list(self.notes)
@@ -163,13 +178,7 @@ def read_log(
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
         first, last = parsed_rows(rows, log.samples)
-        return replace(
-            log,
-            time=log.time[first:last],
-            u=log.u[first:last],
-            y=log.y[first:last],
-            rows=(log.rows[0] + first, log.rows[0] + last),
-        )
+        return log.between(first, last)
     signals = ("time", *input_names, *output_names)
     for option, mapping in (("columns", columns or {}), ("scales", scales or {})):
         wrong = [name for name in mapping if name not in signals]

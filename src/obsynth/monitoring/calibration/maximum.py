@@ -102,6 +102,11 @@ class Objective:
         variables = np.concatenate([t / self.problem.widths, self.variances])
         return np.asarray(np.clip(variables[self.free], self.low, self.high))
 
+    def free_of(self, v: FloatArray) -> FloatArray:
+        """Return free variables from ``[t, log q, log r]``."""
+        whole = np.concatenate([v[: self.nt] / self.problem.widths, v[self.nt :]])
+        return np.asarray(np.clip(whole[self.free], self.low, self.high))
+
     def full(self, z: FloatArray) -> FloatArray:
         """Return ``[t, log q, log r]``."""
         variables = np.concatenate([np.zeros(self.nt), self.variances])
@@ -199,9 +204,16 @@ def descent(
     return float(result.fun), at(result.x)
 
 
-def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callable[[str], object]) -> Maximum:
-    """Return the best of several searches, polished."""
+def greatest_likelihood(
+    objective: Objective, fits: Sequence[Fit], note: Callable[[str], object], known: FloatArray | None = None
+) -> Maximum:
+    """Return the best of several searches, polished; of one, where it is ``known`` about where the maximum is, as
+    ``[t, log q, log r]``."""
     count, best, value = 0, None, np.inf
+    if known is not None:
+        note("likelihood, from what is known")
+        value, best = objective.descent(objective.free_of(known))
+        fits = fits if value >= IMPOSSIBLE else []
     for i, fit in enumerate(fits):
         if i and fit.cost - fits[0].cost < SAME_MINIMUM * abs(fits[0].cost):
             continue
@@ -225,7 +237,7 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
     # What drives coloured noise moves a sensor from row to row by the same whatever its correlation: the search begins
     # again from others, where this one ended.
     problem = objective.problem
-    for i in range(len(problem.names), objective.nt):
+    for i in range(len(problem.names), objective.nt) if fits else ():
         for samples in CORRELATIONS:
             note(f"{problem.unknown[i]}, start {samples:g} samples")
             start = best.copy()

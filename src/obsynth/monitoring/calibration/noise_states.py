@@ -88,6 +88,7 @@ class PlantWithNoise(CalibrationPlant):
         self.units, self.has_levels, self.own_integration = inner.units, inner.has_levels, inner.own_integration
         self.notes = () if set(inner.unknown_inputs) <= set(states.loads) else inner.notes
         self.unknown_inputs = inner.unknown_inputs
+        self.walking = tuple(name for name in inner.walking if name not in states.loads)
         self.nominal_signals = inner.nominal_signals
         means = [float(inner.values[name]) for name in states.loads]
         self.nominal_state = np.concatenate([inner.nominal_state, np.zeros(len(added) - len(means)), means])

@@ -43,6 +43,7 @@ class CalibrationPlant(ABC):
     notes: tuple[str, ...] = ()  # sentences of every verdict
     has_levels: bool = True  # whether signals are values, and no deviations from an operating point
     unknown_inputs: tuple[str, ...] = ()  # of which nothing is known, among ``values``
+    walking: tuple[str, ...] = ()  # what may be taken as a random walk, among ``values``
     bounds: Mapping[str, tuple[float, float]] = MappingProxyType({})  # of what is sought beside constants, by name
 
     own_integration: str  # unless something else is asked for; a discrete plant is stepped as it is
@@ -73,7 +74,7 @@ class NonlinearPlant(CalibrationPlant):
         self.model = model
         self.state_names, self.equation_names = model.state_names, model.equation_names
         self.values: Mapping[str, float] = {**model.constants, **model.parameters}
-        self.units = model.units
+        self.units, self.walking = model.units, model.parameter_names
         self.nominal_state, self.state_scales = np.array(model.nominal_state), np.array(model.state_scales)
         self.state_deviations = CALIBRATED_STATE_SHARE * self.state_scales
         self.nominal_signals = np.array(model.nominal_input)

@@ -95,6 +95,11 @@ class CalibrationProblem:
         """Return the same problem with another log of the same signals."""
         return CalibrationProblem(**{**vars(self), "log": log, "u": self.plant.signals(log)})
 
+    def with_whole_log(self, log: RecordedLog) -> CalibrationProblem:
+        """Return the same problem with the log of which it had some rows."""
+        quanta = np.array([quantum(column) for column in log.y.T])
+        return CalibrationProblem(**{**vars(self.with_log(log)), "quanta": quanta, "floors": _floors(log.y, quanta)})
+
 
 def calibration_problem(
     plant: CalibrationPlant,

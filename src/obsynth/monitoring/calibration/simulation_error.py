@@ -44,6 +44,10 @@ MOVING_SIGNAL = 3.0
 #: A simulated output that moves by less than this share of what its sensor does is moved by no input.
 UNMOVED_OUTPUT = 1e-9
 
+#: A simulation is off by what runs away if no more than this share of it is left beside a polynomial of so many degrees
+#: (what is integrated twice, with what drag makes of it), in at least so many rows.
+DRIFT_REST, DRIFT_DEGREE, LEAST_DRIFT_ROWS = 0.1, 3, 20
+
 #: Without inputs, outputs that move by more than this multiple of what the states' sizes make are of other units.
 OUTSIZED = 10.0
 
@@ -176,7 +180,7 @@ def simulation_fits(
     fits.sort(key=lambda fit: fit.cost)
     simulated = error.simulated(np.concatenate([fits[0].t, fits[0].x0]) / error.scale)[0]
     judged = _required_sensors(problem, simulated)
-    _require_explained(problem, fits[0].deviations, judged)
+    _require_explained(problem, fits[0].deviations, judged, simulated)
     _require_levels(problem, fits[0], simulated, judged)
     return fits
 
@@ -224,7 +228,9 @@ def _required_sensors(problem: CalibrationProblem, simulated: FloatArray) -> Boo
     return np.asarray(moved | problem.plant.has_levels)
 
 
-def _require_explained(problem: CalibrationProblem, residual: FloatArray, judged: BoolArray) -> None:
+def _require_explained(
+    problem: CalibrationProblem, residual: FloatArray, judged: BoolArray, simulated: FloatArray
+) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
     deviations = np.nanstd(problem.y, axis=0)
     share, moves = _shares(problem, residual)
@@ -238,8 +244,7 @@ def _require_explained(problem: CalibrationProblem, residual: FloatArray, judged
         raise refused(
             "explains-nothing",
             f"The model cannot follow the log: the residual of the best fit is as large as the signals "
-            f"({listed} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
-            "bounds.",
+            f"({listed} of their deviations). {_remedy(problem, simulated, bad)}, the sample time, and the bounds.",
             signals=names,
         )
 
@@ -259,9 +264,39 @@ def _require_levels(problem: CalibrationProblem, fit: Fit, simulated: FloatArray
         listed = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times that of the model" for i in np.flatnonzero(far))
         raise refused(
             "explains-nothing",
-            f"The model cannot follow the log: {listed}. Check units and scales (a factor of 1000?).",
+            f"The model cannot follow the log: {listed}. {_remedy(problem, simulated, far)}.",
             signals=[names[i] for i in np.flatnonzero(far)],
         )
+
+
+def _remedy(problem: CalibrationProblem, simulated: FloatArray, bad: BoolArray) -> str:
+    """Return what to look at where a simulation does not follow some sensors: what runs away as a constant that is
+    integrated does is no other unit."""
+    away = [i for i in np.flatnonzero(bad) if _runs_away(problem.log.time, simulated[:, i], problem.y[:, i])]
+    if not away:
+        return "Check units and scales (a factor of 1000?)"
+    names = ", ".join(problem.output_names[i] for i in away)
+    able = problem.plant.walking
+    given = f" (walks: {', '.join(able)})" if able else ", for which the model needs an unknown input or a parameter"
+    return (
+        f"The simulation runs away from {names} as a constant that is integrated does: a force, a flow or an offset of "
+        f"an input that the model lacks. Take one as a random walk{given}, state what the input is off by, or check "
+        "units and scales"
+    )
+
+
+def _runs_away(time: FloatArray, simulated: FloatArray, y: FloatArray) -> bool:
+    """Whether a simulation is off a sensor by a polynomial of time, which the sensor itself does not follow."""
+    seen = np.isfinite(y) & np.isfinite(simulated)
+    if seen.sum() <= LEAST_DRIFT_ROWS:
+        return False
+    scaled = np.interp(time[seen], (time[seen].min(), time[seen].max()), (-1.0, 1.0))
+    powers = np.vander(scaled, DRIFT_DEGREE + 1)
+    rest = [
+        float(np.std(part - powers @ np.linalg.lstsq(powers, part, rcond=None)[0])) / max(float(np.std(part)), SMALLEST)
+        for part in (simulated[seen] - y[seen], y[seen])
+    ]
+    return bool(rest[0] < DRIFT_REST < rest[1])
 
 
 def _moved_by_noise(problem: CalibrationProblem, deviations: FloatArray) -> bool:
