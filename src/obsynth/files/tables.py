@@ -1,7 +1,4 @@
-"""Tables as comma-separated text that is harmless in spreadsheets, as aligned text, and as HTML.
-
-Pages of HTML that stand alone, in one style.
-"""
+"""Tables as comma-separated text that is harmless in spreadsheets, as aligned text, and as pages of HTML."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Batches of trials, for every observer that has one.
-
-Batches of trials with one observer of a DAE.
-"""
+"""Batches of trials, for every observer that has one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
-"""Nonlinear differential-algebraic plants with unknown parameters, and checks of what they are made of.
-
-Their equations, stored quantities and outputs as CasADi expressions, which are exact to differentiate.
+"""Nonlinear differential-algebraic plants with unknown parameters: equations as CasADi expressions, and their
+checks.
 """
 
 from __future__ import annotations

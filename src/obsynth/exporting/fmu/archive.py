@@ -1,7 +1,4 @@
-"""Writing an FMU: the C of the observer, its description, and a binary where a compiler is.
-
-The model description of an FMU, in XML, for FMI 2.0 and 3.0: inputs, estimates, points, thresholds and alarms.
-"""
+"""An FMU of an observer, for FMI 2.0 and 3.0: its model description in XML, its C, and a binary where a compiler is."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""From a fit to a calibration: tables by name, checks of the innovations, and a sentence for each thing found.
-
-How a model is to be integrated on a log: what a step of backward Euler errs, against the noise of the sensors.
-"""
+"""What a step of backward Euler errs on a log, against the noise of the sensors: how the model is to be integrated."""
 
 from __future__ import annotations
 

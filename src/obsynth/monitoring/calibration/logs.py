@@ -1,6 +1,5 @@
-"""Recorded logs: their columns by signal, a regular grid of stamps, and what makes a log unusable.
-
-Why a log cannot be used, or a model not be fitted to it: errors with a code that stays the same.
+"""Recorded logs for calibration: columns by signal, a regular grid of stamps, and errors by code where one cannot be
+used.
 """
 
 from __future__ import annotations

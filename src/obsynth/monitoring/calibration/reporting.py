@@ -1,7 +1,4 @@
-"""From a fit to a calibration: tables by name, checks of the innovations, and a sentence for each thing found.
-
-How a model is to be integrated on a log: what a step of backward Euler errs, against the noise of the sensors.
-"""
+"""From a fit to a calibration: tables by name, checks of the innovations, and a sentence for each thing found."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a calibration found, frozen, with a table for people and plain data for programs.
-
-A box of constants that a log allows, with its level: what tolerances take.
-"""
+"""What a calibration found, frozen, with a table for people and plain data for programs."""
 
 from __future__ import annotations
 

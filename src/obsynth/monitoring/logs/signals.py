@@ -1,4 +1,4 @@
-"""The columns of a log: time stamps as seconds or dates, and signals as deviations from the operating point."""
+"""Signals of a log: which columns they are in, and their values as deviations from the operating point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The columns of a log: time stamps as seconds or dates, and signals as deviations from the operating point."""
+"""Time stamps of a log: numbers in a unit of time, dates in a zone, serial days; as seconds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -16,10 +16,6 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.input_derivatives import derivative_of
-
-if TYPE_CHECKING:
-    pass
-
 
 #: What a missing sample may look like in a log.
 MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})

@@ -1,7 +1,4 @@
-"""The observer of states and parameters of a nonlinear DAE that a design ships.
-
-Whole records through an observer of a DAE: in stretches inside CasADi, with single steps where those fail.
-"""
+"""The observer of states and parameters of a nonlinear DAE: single steps, and whole records inside CasADi."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Functional mock-up units (FMI 2 and 3, model exchange), linearised at an operating point by their own derivatives, or
-by central differences.
-
-One instance of an FMU for model exchange, of either version of FMI, with the same few functions.
+"""Functional mock-up units (FMI 2 and 3, model exchange), linearised at an operating point by their own derivatives,
+or by central differences.
 """
 
 from __future__ import annotations

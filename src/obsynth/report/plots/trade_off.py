@@ -1,4 +1,4 @@
-"""Designs against one another: what one promise costs in another, scans of delta, studies of tolerances, sweeps."""
+"""Pictures of what one claim costs in another: gain against delay, region, rate or a swept entry."""
 
 from __future__ import annotations
 

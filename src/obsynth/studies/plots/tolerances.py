@@ -1,4 +1,4 @@
-"""Designs against one another: what one promise costs in another, scans of delta, studies of tolerances, sweeps."""
+"""The picture of a study of tolerances."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it.
-
-Whether a plant is stable, and of index 1 (or 0), at every point of its box.
-"""
+"""Whether a plant is stable and of index 1 at every point of a box: it is cut until each part is proved or refuted."""
 
 from __future__ import annotations
 
