@@ -27,8 +27,9 @@ import flint
 import numpy as np
 
 from obsynth.analysis.time_varying import IntArray
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.invariant_zeros import is_outside
+from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.ranks import HIDDEN_MODE_TOLERANCE
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
@@ -56,7 +57,7 @@ SLOWEST_SETTLING, ALIKE = 1e-7, 0.5
 SLOWEST_COUNTED = 1e-5
 
 #: Outputs and states are known well enough for what rounding adds to them where they are to this share of the largest.
-KNOWN_SHARE = 0.01
+LARGEST_ENCLOSURE = 0.01
 
 #: Name of the row.
 CONSTANT_FAULT = "constant fault"
@@ -285,7 +286,7 @@ def _magnitudes(given: ConstantFaults, observer: LinearObserver) -> tuple[FloatA
 
 def _is_narrow(ball: Ball) -> bool:
     """Return whether each column is known to a share of its largest entry; one that may be zero is not."""
-    return bool(np.all(ball.radius <= KNOWN_SHARE * np.max(np.abs(ball.midpoint), axis=0, initial=0.0)))
+    return bool(np.all(ball.radius <= LARGEST_ENCLOSURE * np.max(np.abs(ball.midpoint), axis=0, initial=0.0)))
 
 
 def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
@@ -358,15 +359,22 @@ def _settles(model: ErrorModel, rate: float) -> bool:
 
 def _grows(plant: DescriptorSystem) -> bool:
     """Return whether faults drive an unstable mode of the plant: its state leaves the one at which it would stay."""
-    from scipy.linalg import eig
-
     scaling = natural_scaling(plant)
     e, a, bf = scaling.scale_dynamics(plant.E), scaling.scale_dynamics(plant.A), scaling.scale_input(plant.Bf)
+    if not any(_unstable(eigenvalues(a, e), plant.dt)):
+        return False
+    from scipy.linalg import eig
+
     with np.errstate(all="ignore"):
         poles, left = eig(a, e, left=True, right=False)
-    unstable = [bool(np.isfinite(pole)) and is_outside(complex(pole), plant.dt) for pole in poles]
+    unstable = _unstable(poles, plant.dt)
     driven = np.abs(left[:, unstable].conj().T @ bf)
     return bool(np.any(driven > HIDDEN_MODE_TOLERANCE * np.linalg.norm(bf, axis=0)))
+
+
+def _unstable(poles: ComplexArray, dt: float) -> list[bool]:
+    """Return which of the poles are finite and do not decay."""
+    return [bool(np.isfinite(pole)) and is_outside(complex(pole), dt) for pole in poles]
 
 
 def _state_at(plant: DescriptorSystem, point: float) -> FloatArray | None:
