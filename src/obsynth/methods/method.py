@@ -99,6 +99,8 @@ class Method(ABC):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {}
     #: Matrices that its certificate may hold.
     witnesses: ClassVar[frozenset[str]] = frozenset()
+    #: Its observers add constants to their outputs, which its own checks cover.
+    adds_constants: ClassVar[bool] = False
     #: What `auto` takes it for; nothing: only who names it gets it.
     purposes: ClassVar[frozenset[Purpose]] = frozenset()
     #: Claims that say what was imposed and proved, not what was found.

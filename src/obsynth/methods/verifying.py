@@ -80,7 +80,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         tracked = linear and (not own or method.has_error_model(design))
         if tracked and all(row.passed for row in rows):
             model = method.error_model(design)
-            rows = (*rows, error_model_row(model, printed_digits))
+            rows = (*rows, error_model_row(model, printed_digits, constants_allowed=method.adds_constants))
             gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None
             if model is not None and rows[-1].passed:
                 rows = (*rows, *stored_number_rows(design, model, gamma), *derivation_rows(design, model))

@@ -377,12 +377,16 @@ def _remainders_of(_observer: LinearObserver) -> ByNumbers[RemainderChannel]:
     return ByNumbers()
 
 
-def error_model_row(model: ErrorModel | None, printed_digits: int | None) -> Check:
-    """Return the row that says whether a shipped observer follows what its error model says."""
+def error_model_row(model: ErrorModel | None, printed_digits: int | None, *, constants_allowed: bool = False) -> Check:
+    """Return the row that says whether a shipped observer follows what its error model says.
+
+    ``constants_allowed``: constants that it adds to its outputs are checked by the method."""
     name, claim = "error model", "the observer follows the plant, and its outputs are what they stand for"
     source = "Az T E + By C = T A, Bu + By D = T B, Cz T E + Dy C + T0 A = goal, Du + Dy D + T0 B = 0, T0 E = 0"
-    if model is None or not model.fits:
+    added = model is not None and model.observer.constant is not None and not constants_allowed
+    if model is None or not model.fits or added:
         why = "the method gives none" if model is None else "its matrices do not fit plant and observer"
+        why = "the observer adds constants to what it estimates" if added else why
         return upper_bound_check(name, claim, np.nan, IDENTITY_SHARE, source=source, kind="equality", detail=why)
     bound = IDENTITY_SHARE if printed_digits is None else PRINTED_SHARE
     return upper_bound_check(

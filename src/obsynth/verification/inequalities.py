@@ -41,6 +41,9 @@ from obsynth.verification.error_system import contraction_of
 #: A claimed rate is proved for all but this share of it.
 RATE_TOLERANCE = 1e-4
 
+#: Squares hide the sign of what is claimed.
+_NO_GAIN = "the gain is not above 0"
+
 
 def prove_bounded_real(
     plant: DescriptorSystem,
@@ -148,6 +151,8 @@ def prove_gain(
     positive = prove_symmetric_positive(P)
     if not positive.proved:
         return unproved(f"P itself: {positive.reason}")
+    if not gain > 0.0:
+        return unproved(_NO_GAIN)
     states, inputs, outputs = Ball.of(a), Ball.of(b), Ball.of(c)
     through = Ball.of(np.zeros((outputs.shape[0], inputs.shape[1])) if direct is None else direct)
 
@@ -177,6 +182,8 @@ def prove_norm(system: System, P: FloatArray, gain: float, *, dt: float) -> Defi
     positive = prove_symmetric_positive(P)
     if not positive.proved:
         return unproved(f"P itself: {positive.reason}")
+    if not gain > 0.0:
+        return unproved(_NO_GAIN)
 
     def formula(kind: type[Enclosed]) -> Enclosed:
         a, b, c, d = system(kind)
@@ -208,6 +215,8 @@ def prove_norm_by_eigenvalues(system: System, order: int, gain: float, *, dt: fl
     ``g^2 I - D'D > 0``, and no eigenvalue of the Hamiltonian matrix lies on the imaginary axis: all are enclosed.
     Discrete time is mapped by ``s = (z - 1) / (z + 1)``, which keeps the norm.  Boyd, Balakrishnan, Kabamba 1989.
     """
+    if not gain > 0.0:
+        return unproved(_NO_GAIN)
     if not 0 < 2 * order <= MOST_ENCLOSED:
         return unproved("the system has no states, or too many for all eigenvalues to be enclosed")
     for bits in EIGENVALUE_BITS:

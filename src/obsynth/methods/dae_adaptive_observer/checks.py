@@ -255,7 +255,7 @@ def _derivative_gap(observer: DAEObserver) -> float:
         moved[j] = DERIVATIVE_DIFFERENCE * size
         slope = (step_and_outputs(centre + moved) - step_and_outputs(centre - moved)) / (2.0 * DERIVATIVE_DIFFERENCE)
         gap = np.abs(slope - exact[:, j] * size) / rows
-        worst = max(worst, float(gap.max()) / max(1.0, float(np.abs(exact[:, j] * size / rows).max())))
+        worst = float(np.maximum(worst, gap.max() / max(1.0, float(np.abs(exact[:, j] * size / rows).max()))))
     return worst
 
 

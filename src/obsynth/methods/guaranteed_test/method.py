@@ -165,6 +165,7 @@ class GuaranteedTestMethod(TestOptions, Method):
         ),
     }
     over_scenario: ClassVar[bool] = True
+    adds_constants: ClassVar[bool] = True
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}
         | {"state_tracking", "state_rows", "record"}

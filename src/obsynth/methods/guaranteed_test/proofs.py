@@ -225,7 +225,7 @@ def proved_least(window: Window, repaired: NearbySolution) -> float:
     if window.question.ellipsoid:
         for group in np.unique(groups[groups >= 0]):
             part = sizes[groups == group]
-            worst = max(worst, float(rounded_up(np.sqrt(np.sum(part**2)), 2 * len(part) + 8)))
+            worst = float(np.maximum(worst, rounded_up(np.sqrt(np.sum(part**2)), 2 * len(part) + 8)))
     return down(Fraction(float(repaired.values[0])) / Fraction(worst))
 
 

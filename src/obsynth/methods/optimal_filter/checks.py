@@ -17,6 +17,8 @@ from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
+from obsynth.proofs.contraction import prove_contraction
+from obsynth.proofs.definiteness import unproved
 from obsynth.results.checks import Check, fitting_check, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed, listed_gains
@@ -77,6 +79,10 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     level = claims["gain"] / channel.unit
     if "P" in matrices:
         proof, source = prove_norm(channel, matrices["P"], level, dt=plant.dt), "bounded real lemma"
+    elif not all(_decays(model, plant) for model in (_reference(matrices), *(weights or ())) if model is not None):
+        # Of the filter's own states the row on its poles says so.
+        proof = unproved("no decay is proved of the weights, or of the reference model")
+        source = "eigenvalues of the Hamiltonian matrix"
     else:
         proof = prove_norm_by_eigenvalues(channel, channel.order, level, dt=plant.dt)
         source = "eigenvalues of the Hamiltonian matrix"
@@ -179,6 +185,11 @@ def _is_stable(reference: Model, plant: DescriptorSystem) -> bool:
     return bool(np.all(np.abs(modes) < 1.0) if plant.is_discrete else np.all(modes.real < 0.0))
 
 
+def _decays(model: Model, plant: DescriptorSystem) -> bool:
+    """Return whether all states of a model are proved to decay."""
+    return not len(model[0]) or prove_contraction(model[0], discrete=plant.is_discrete) is not None
+
+
 def _reference(matrices: Mapping[str, FloatArray]) -> Model | None:
     names = [f"reference_{name}" for name in "ABCD"]
     if any(name not in matrices for name in names):
@@ -234,7 +245,8 @@ def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int
     for point in points:
         found = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
         wanted = np.diag(point**-late) if reference is None else _response(reference, point)
-        worst = max(worst, float(np.max(np.abs(found - wanted), initial=0.0)))
+        # What is no number stays none, and fails.
+        worst = float(np.maximum(worst, np.max(np.abs(found - wanted), initial=0.0)))
         largest = max(largest, float(np.max(np.abs(wanted), initial=0.0)))
     return (worst / largest if largest > 0.0 else worst), count
 

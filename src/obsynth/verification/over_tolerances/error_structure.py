@@ -168,7 +168,7 @@ def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: Floa
 def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
     """Raise `PreconditionError` where the observer is none of the nominal plant."""
     missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
-    missed = max(missed, float(np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
+    missed = float(np.maximum(missed, np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
     if not missed <= IDENTITY_SHARE:
         raise PreconditionError(
             f"The observer's identities do not hold on the nominal plant (by {missed:.1e} of their terms): a bound "
