@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.proofs.vertex_inequalities import Witness, pairs_of, prove_mean_square
+from obsynth.verification.over_region import decay_row, forgetting_row
 
 PLANT = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], Bw=[[0.1]], Dw=[[1.0]], dt=0.1)
 DESIGNS = {
@@ -35,3 +37,41 @@ def test_a_negative_gain_is_no_bound() -> None:
     )
     report = obsynth.verify(replace(design, certificate=certificate, report=None))
     assert "gain" in {row.name for row in report.failures}
+
+
+def test_a_mean_square_with_steps_holds_between_the_corners_too() -> None:
+    """The trace at the corners of the steps is 1.5 squared at most; at rest in the middle the mean square is larger."""
+
+    def vertex(t: float):
+        def matrices(kind):
+            numbers = ([[0.0, 10.0 * t], [0.0, 0.0]], [[0.0], [1.0 - t]], np.eye(2), np.zeros((2, 1)))
+            return tuple(kind.exact(np.array(each)) for each in numbers)
+
+        return matrices
+
+    witness = Witness([np.diag([1.05, 1.01]), np.diag([1.05, 111.01])], [np.diag([1.05, 120.0])], pairs_of(2, 0.01))
+    vertices = [vertex(0.0), vertex(1.0)]
+    assert not prove_mean_square(vertices, witness, 1.5, discrete=True).proved
+    assert prove_mean_square(vertices, witness, 12.0, discrete=True).proved
+
+
+def test_a_negative_decay_is_none() -> None:
+    one = np.ones((1, 1))
+    vertices = [lambda kind: (kind.exact(2.0 * one), kind.exact(one), kind.exact(one), kind.exact(0.0 * one))] * 2
+    assert not decay_row(vertices, Witness([one]), -3.0, discrete=True, words="").passed
+    assert not forgetting_row(0.99999, 100_001.0, discrete=True).passed
+
+
+def test_unknown_inputs_are_decoupled_in_any_unit() -> None:
+    plant = obsynth.PolytopicSystem(
+        plant={
+            "A": [["0.5*v", 0, 0], [0, 0.4, 0], [0, 0, 0.3]],
+            "Bd": [[1e8, 0], [1e8, 0], [0, 1e-3]],
+            "C": np.eye(3).tolist(),
+            "dt": 1.0,
+        },
+        scheduling={"v": [0, 1]},
+    )
+    design = obsynth.descriptor_kalman(plant, Q=1e-8, R=1e-8)
+    missed = np.abs(design.certificate.matrices["tracking"] @ plant.vertices[0].Bd).max(axis=0)
+    assert np.all(missed <= 1e-12 * np.abs(plant.vertices[0].Bd).max(axis=0))

@@ -354,6 +354,11 @@ class _Forms:
         return formula
 
     def _trace_form(self, now: FloatArray, then: FloatArray, level: float) -> _Formula:
+        """Return ``level^2 - |Dz|^2 - tr B'PB``; with a slack, ``tr B'G (G + G' - P)^-1 G'B`` by its Schur complement,
+        which is convex in both weights together and not below the trace: corners suffice."""
+        if self.witness.G is not None:
+            return self._trace_form_with_slack(now, then, level)
+
         def formula(kind: type[Enclosed]) -> Enclosed:
             used = np.flatnonzero(now)
             parts = [self.vertices[int(i)](kind) for i in used]
@@ -363,6 +368,28 @@ class _Forms:
                 column, direct = b @ kind.exact(unit), dz @ kind.exact(unit)
                 total = total - column.T @ (after @ column) - direct.T @ direct
             return total
+
+        return formula
+
+    def _trace_form_with_slack(self, now: FloatArray, then: FloatArray, level: float) -> _Formula:
+        def formula(kind: type[Enclosed]) -> Enclosed:
+            _, gb, _, dz, slack = self._at(kind, now)
+            n, p = gb.shape
+            lower, nothing = self._lower(kind, slack, then), _zero(kind, n, n)
+            corner = kind.exact(np.ones((1, 1))).scaled(level).scaled(level)
+            first: list[Enclosed] = []
+            rows: list[list[Enclosed]] = [first]
+            for k in range(p):
+                unit = kind.exact(np.eye(p)[:, [k]])
+                column, direct = gb @ unit, dz @ unit
+                corner = corner - direct.T @ direct
+                first.append(column.T)
+                row: list[Enclosed] = [column]
+                for j in range(p):
+                    row.append(lower if j == k else nothing)
+                rows.append(row)
+            first.insert(0, corner)
+            return block(rows)
 
         return formula
 

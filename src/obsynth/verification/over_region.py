@@ -47,7 +47,7 @@ SWITCHING_HORIZON, SWITCHING_STARTS = 16, 1
 #: With more vertices or errors only courses that stay at a vertex are tried.
 MOST_SWITCHED = 8
 #: Rows without a claim are not counted further.
-MOST_UNCLAIMED_ROWS = 100_000
+MOST_UNCLAIMED_ROWS = 2_000_000_000
 MOST_UNCLAIMED_SECONDS = 1e9
 #: What a logarithm and a quotient may be rounded by.
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
@@ -238,7 +238,7 @@ def _gain_along(closed: Sequence[tuple[FloatArray, ...]], course: Sequence[int])
 
 def decay_row(vertices: Sequence[Vertex], witness: Witness | None, rate: float, *, discrete: bool, words: str) -> Check:
     """Return the row that errors decay."""
-    sound = witness is not None and (rate < 1.0 if discrete else rate > 0.0)
+    sound = witness is not None and (0.0 <= rate < 1.0 if discrete else rate > 0.0)
     proof = prove_decay(vertices, witness, rate, discrete=discrete) if sound and witness else _no_certificate()
     how = "by this factor a sample" if discrete else "like exp(-rate t)"
     return _proof_row(DECAY_ROW, f"decay rate over the region: errors decay at least {how}, {words}", rate, proof)
@@ -264,10 +264,14 @@ def _proof_row(name: str, claim: str, value: float, proof: VertexProof) -> Check
 
 def rows_to_forget(decay: float) -> int:
     """Return after how many samples a hundredth of an error is left at most, in the norm of the certificate."""
+    return int(min(_rows_to_forget(decay), MOST_UNCLAIMED_ROWS))
+
+
+def _rows_to_forget(decay: float) -> float:
+    """Return the same without an end: infinite where nothing decays."""
     if not 0.0 < decay < 1.0:
-        return 1 if decay == 0.0 else MOST_UNCLAIMED_ROWS
-    count = np.log(FORGOTTEN_SHARE) / np.log(decay)
-    return 1 + int(min(np.ceil(count), MOST_UNCLAIMED_ROWS))
+        return 1.0 if decay == 0.0 else np.inf
+    return 1.0 + float(np.ceil(np.log(FORGOTTEN_SHARE) / np.log(decay)))
 
 
 def seconds_to_forget(rate: float) -> float:
@@ -286,7 +290,7 @@ def forgetting_row(decay: float, forgetting: float, *, discrete: bool) -> Check:
         "rows without a claim",
         "after a row outside the region nothing is claimed until a hundredth of its error is left"
         + ("" if discrete else " (seconds)"),
-        float(rows_to_forget(decay) if discrete else seconds_to_forget(decay) * (1.0 - _ROUNDING)),
+        _rows_to_forget(decay) if discrete else seconds_to_forget(decay) * (1.0 - _ROUNDING),
         float(forgetting),
         source="decay over the region",
     )

@@ -35,9 +35,11 @@ def kalman_conditions_over_region(plant: PolytopicSystem) -> tuple[Condition, ..
 def free_equations(plant: PolytopicSystem) -> FloatArray:
     """Return rows ``(ne, nx)``: combinations of the equations that no unknown input enters at any vertex."""
     entering = np.hstack([vertex.Bd for vertex in plant.vertices]) if plant.nd else np.zeros((plant.nx, 0))
-    if not entering.any():
+    sizes = np.max(np.abs(entering), axis=0, initial=0.0)
+    if not sizes.any():
         return np.eye(plant.nx)
-    left, values, _ = np.linalg.svd(entering)
+    # Each unknown input has units of its own.
+    left, values, _ = np.linalg.svd(entering[:, sizes > 0.0] / sizes[sizes > 0.0])
     return np.asarray(left[:, numerical_rank(values) :].T)
 
 

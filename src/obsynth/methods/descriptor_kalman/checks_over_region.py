@@ -96,12 +96,15 @@ def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatAr
 
 
 def _unknown_input_row(plant: PolytopicSystem, tracking: FloatArray) -> Check:
-    misses = [float(np.max(np.abs(tracking @ vertex.Bd), initial=0.0)) for vertex in plant.vertices]
-    sizes = [float(np.max(np.abs(tracking) @ np.abs(vertex.Bd), initial=0.0)) for vertex in plant.vertices]
+    # Each unknown input has units of its own: it is compared with its own terms.
+    entering = np.hstack([vertex.Bd for vertex in plant.vertices])
+    misses = np.max(np.abs(tracking @ entering), axis=0, initial=0.0)
+    sizes = np.max(np.abs(tracking) @ np.abs(entering), axis=0, initial=0.0)
+    shares = np.divide(misses, sizes, out=np.zeros(len(sizes)), where=sizes > 0.0)
     return equality(
         "unknown inputs decoupled",
         "T Bd = 0: no unknown input has an effect on the error, at every vertex",
-        Residual(max(misses), max(sizes)),
+        Residual(float(np.max(shares, initial=0.0)), 1.0),
         "equations that an unknown input enters are left out",
     )
 
