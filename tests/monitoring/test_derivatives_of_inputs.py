@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 
 import numpy as np
@@ -162,13 +163,27 @@ def test_differences_go_on_from_chunk_to_chunk():
     first, before = difference_quotients(times, values, 1, None)
     assert first.tolist() == [0.0, 1.0, 2.0, -6.0]
     second, _ = difference_quotients(times, values, 2, None)
-    assert second.tolist() == [0.0, 1.0, 0.5, -8.0]
+    assert second == pytest.approx([0.0, 1.0, 2.0 / 3.0, -16.0 / 3.0], abs=1e-15)
     for order, whole in ((1, first), (2, second)):
         before, parts = None, []
         for place in range(4):
             part, before = difference_quotients(times[place : place + 1], values[place : place + 1], order, before)
             parts.extend(part)
         assert parts == whole.tolist()
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_a_polynomial_of_the_order_is_exact_at_any_times(order: int):
+    times = np.array([0.0, 1.0, 3.0, 4.0, 6.0, 7.0, 9.0])
+    quotients, _ = difference_quotients(times, times**order, order, None)
+    assert quotients[order:] == pytest.approx(np.full(7 - order, float(math.factorial(order))))
+
+
+def test_rows_that_the_clock_leaves_out_are_no_samples_of_the_input(design, log):
+    late = log.drop(columns="slope")
+    late.loc[200, ["time", "u"]] = [2.0, 50.0]
+    without = estimates(obsynth.run_on_data(design, late.drop(index=200)))
+    assert estimates(obsynth.run_on_data(design, late))[-500:] == pytest.approx(without[-500:], abs=1e-9)
 
 
 CAM = """

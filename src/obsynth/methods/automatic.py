@@ -82,7 +82,8 @@ def expected_of(sampled: DescriptorSystem, scenario: Scenario | None) -> Expecte
             Dw=np.hstack([factor * sampled.Dw, np.diag(deviations)]),
             noise_names=None,
         )
-    return Expected(plant, sizes)
+    # Nothing is hidden by noise that nobody stated.
+    return Expected(plant, sizes if plant.Bw.any() or plant.Dw.any() else {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,21 +29,23 @@ def derivative_of(name: str, inputs: Sequence[str]) -> tuple[str, int] | None:
 def difference_quotients(
     times: FloatArray, values: FloatArray, order: int, before: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return divided differences of samples ``(n,)`` from row to row, and what the next rows need of the last one.
+    """Return derivatives of samples ``(n,)`` by divided differences over the last ``order + 1`` rows, and what the next
+    rows need of the last ones.
 
-    ``before``: what the rows before left, ``(1 + order,)``: their last time, value, and its derivatives of lower order;
-    without any, the input is taken as constant until the first row.  A quotient has the error of a first-order
-    backward difference: half the step times the next derivative.
+    ``before``: what the rows before left, ``(2 order,)``: their last times, the latest first, the last value, and its
+    derivatives of lower order; without any, the input is taken as constant until the first row.  A polynomial of this
+    order is exact at any times; else the error is of the first order in the steps, as of a backward difference.
     """
     if before is None:
-        before = np.concatenate([[times[0] - 1.0, values[0]], np.zeros(order - 1)])
-    last = np.concatenate([[times[-1], values[-1]], np.zeros(order - 1)])
-    steps = np.diff(times, prepend=before[0])
-    # Times that do not increase are refused where rows are checked.
-    steps[~(steps > 0.0)] = np.nan
+        before = np.concatenate([times[0] - np.arange(1.0, order + 1.0), [values[0]], np.zeros(order - 1)])
+    every = np.concatenate([before[:order][::-1], times])
+    last = np.concatenate([every[: -order - 1 : -1], [values[-1]], np.zeros(order - 1)])
     quotients = values
     for k in range(order):
-        quotients = np.diff(quotients, prepend=before[1 + k]) / steps
+        spans = times - every[order - k - 1 : len(every) - k - 1]
+        # Times that do not increase are refused where rows are checked.
+        spans[~(spans > 0.0)] = np.nan
+        quotients = (k + 1) * np.diff(quotients, prepend=before[order + k]) / spans
         if k < order - 1:
-            last[2 + k] = quotients[-1]
+            last[order + 1 + k] = quotients[-1]
     return quotients, last

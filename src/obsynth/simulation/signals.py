@@ -176,6 +176,12 @@ def _form_derivatives(
     for column, name in enumerate(inputs):
         base = None if name in scenario.inputs else derivative_of(name, inputs)
         if base is not None:
+            if scenario.stabilise:
+                raise SpecError(
+                    f"A stabilising feedback moves {base[0]!r}, of which {name!r} is needed and no profile is given: "
+                    "leave stabilise out, or take a plant without it.",
+                    path="stabilise",
+                )
             quotients, _ = difference_quotients(times, left[:, inputs.index(base[0])], base[1], None)
             left[:, column] = right[:, column] = quotients
 

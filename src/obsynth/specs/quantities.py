@@ -11,7 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.measurement_units import conversion, is_temperature
 
 #: A number with the word behind it.
-QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s.].*?)\s*")
+QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*((?![eE][+-]?\d)[^\d\s.,].*?)\s*")
 
 #: Groups of numbers by signal whose zeros count, and those that are differences: 0.1 K are 0.1 degC there.
 _VALUES = ("operating_point", "states", "inputs")

@@ -79,6 +79,13 @@ class LogSignals:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
         uncertain = getattr(getattr(observer, "plant", None), "uncertainty", None)
         shift = getattr(observer, "shift", None) if uncertain is None else uncertain.shift
+        scaled = {*factors, *observer.scales}
+
+        def base_of(name: str) -> str | None:
+            # A derivative has the factor of its input where it states none.
+            base = derivative_of(name, observer.input_names) if name in observer.input_names else None
+            return None if base is None else base[0]
+
         return cls(
             names,
             tuple(_column(name, names, renamed) for name in (TIME_HEADER, *names) if not shift or name != shift),
@@ -88,7 +95,7 @@ class LogSignals:
             names.index(shift) if shift and shift in names else None,
             len(observer.input_names) - int(bool(shift) and shift in observer.input_names),
             observer.input_delay,
-            {name: unit for name, unit in units.items() if name not in factors and name not in observer.scales},
+            {name: unit for name, unit in units.items() if name not in scaled and base_of(name) not in scaled},
         )
 
     @property
@@ -145,7 +152,8 @@ class LogSignals:
         matches = [column_of(header, name) for name in self.columns]
         for i, name in enumerate(self.columns):
             # A derivative that has no column is formed from that of its input.
-            base = derivative_of(name, self.columns) if matches[i] is None else None
+            known = self.columns[1 : 1 + self.inputs]
+            base = derivative_of(name, known) if matches[i] is None and name in known else None
             matches[i] = matches[i] if base is None else matches[self.columns.index(base[0])]
         missing = sorted({name for name, present in zip(self.columns, matches, strict=True) if present is None})
         if missing:

@@ -90,9 +90,14 @@ def _differenced(found: Iterator[FloatArray], stamps: Stamps, *, goes_on: bool) 
     """Yield rows with the derivatives of known inputs that no column has; ``goes_on``: after the rows of a state."""
     before = stamps.differenced if goes_on else {}
     for chunk in found:
+        latest = max((float(known[0]) for known in before.values()), default=-np.inf)
+        # Rows that the clock leaves out, since they are no later than others, are no samples of the input.
+        rising = chunk[:, 0] > np.fmax.accumulate(np.concatenate([[latest], chunk[:, 0]]))[:-1]
         for place, (base, order) in stamps.formed.items():
-            values = chunk[:, base].copy()
-            chunk[:, place], before[place] = difference_quotients(chunk[:, 0], values, order, before.get(place))
+            times, values = chunk[rising, 0], chunk[rising, base]
+            chunk[:, place] = np.nan
+            if rising.any():
+                chunk[rising, place], before[place] = difference_quotients(times, values, order, before.get(place))
         stamps.differenced = before
         yield chunk
 

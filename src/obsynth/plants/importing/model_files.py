@@ -41,6 +41,9 @@ _UNSAID = -1.0
 #: Sampling times that differ by less were rounded.
 _SAME_TIME = 1e-12
 
+#: The next states of an equilibrium repeat its states to this share.
+ROUNDED_OFFSET = 1e-9
+
 #: Delays of inputs and of outputs, in the TimeUnit, or in samples.
 _DELAYS_OF = {"InputDelay": "input_names", "OutputDelay": "output_names"}
 
@@ -167,8 +170,9 @@ def from_matlab(
         raise SpecError(
             f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
         )
+    is_struct = fields is not content and fields.keys() != content.keys()
     fields = _with_offsets(fields, source)
-    _require_understood(fields, source, is_struct=fields is not content and fields.keys() != content.keys())
+    _require_understood(fields, source, is_struct=is_struct)
     unit = _seconds_of_unit(fields, source)
     step = _step(fields, dt, unit, source)
     names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
@@ -285,13 +289,28 @@ def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
     unknown = [name for name in given if name not in (*_OFFSETS, "dx")]
     if unknown:
         raise SpecError(f"{source}: Offsets has the field {unknown[0]!r}; known are dx, x, u, y.", path=str(source))
-    if np.any(_numbers_in(given.pop("dx", 0.0))):
+    if not _is_at_rest(given.pop("dx", None), given.get("x"), sampled=_is_sampled(fields)):
         raise SpecError(
-            f"{source}: Offsets.dx is not zero, so the operating point is no equilibrium and deviations from it obey "
-            "no linear model without a constant term: linearise in a steady state.",
+            f"{source}: by Offsets.dx the operating point is no equilibrium, and deviations from it obey no linear "
+            "model without a constant term: linearise in a steady state.",
             path=str(source),
         )
     return {**rest, **{_OFFSETS[name]: value for name, value in given.items()}}
+
+
+def _is_sampled(fields: Mapping[str, Any]) -> bool:
+    return bool(np.any(_numbers_in(fields.get("Ts", 0.0))))
+
+
+def _is_at_rest(moved: Any, states: Any, *, sampled: bool) -> bool:
+    """Return whether MATLAB's ``dx`` says so: derivatives of the states or, of a sampled model, their next values."""
+    if moved is None:
+        return True
+    at = _numbers_in(0.0 if states is None or not sampled else states).ravel()
+    if at.size not in (1, np.size(moved)):
+        return False
+    difference = _numbers_in(moved).ravel() - at
+    return bool(np.all(np.abs(difference) <= ROUNDED_OFFSET * np.abs(at)))
 
 
 def _numbers_in(value: Any) -> FloatArray:

@@ -27,6 +27,9 @@ PICTURE = FileKind("a picture", rb"\A\x89PNG")
 #: More designs than these are made on all processors: a process takes as long to begin as several small designs.
 FEW_DESIGNS = 10
 
+#: Windows waits for no more processes at once.
+MOST_PROCESSES = 61
+
 #: Blanks between columns.
 _BLANKS_BETWEEN = 2
 
@@ -180,7 +183,7 @@ def _print_outcome(options: argparse.Namespace, outcome: Any, files: tuple[Path,
 
 def usual_jobs(count: int) -> int:
     """Return on how many processes so many designs are made where nothing is said: one, or one a processor for many."""
-    return 1 if count <= FEW_DESIGNS else usable_processors()
+    return 1 if count <= FEW_DESIGNS else min(usable_processors(), MOST_PROCESSES)
 
 
 def usable_processors() -> int:
