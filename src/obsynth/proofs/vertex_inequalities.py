@@ -259,6 +259,7 @@ class _Forms:
 
     def discrete(self, gain: float | None, decay: float | None, power: float | None) -> Iterator[tuple[str, _Formula]]:
         """Yield place and formula of every matrix in discrete time."""
+        trace = self._trace_form if self.witness.G is None else self._trace_form_with_slack
         for now, then in self.witness.pairs_of(len(self.vertices)):
             place = _place(now, then)
             if gain is not None:
@@ -267,7 +268,7 @@ class _Forms:
                 yield place, self._stable_form(now, then, decay, with_outputs=False)
             if power is not None:
                 yield place, self._stable_form(now, then, 1.0, with_outputs=True)
-                yield f"{place}, mean square", self._trace_form(now, then, power)
+                yield f"{place}, mean square", trace(now, then, power)
 
     def continuous(
         self, gain: float | None, decay: float | None, power: float | None
@@ -354,10 +355,7 @@ class _Forms:
         return formula
 
     def _trace_form(self, now: FloatArray, then: FloatArray, level: float) -> _Formula:
-        """Return ``level^2 - |Dz|^2 - tr B'PB``; with a slack, ``tr B'G (G + G' - P)^-1 G'B`` by its Schur complement,
-        which is convex in both weights together and not below the trace: corners suffice."""
-        if self.witness.G is not None:
-            return self._trace_form_with_slack(now, then, level)
+        """Return ``level^2 - |Dz|^2 - tr B'PB``."""
 
         def formula(kind: type[Enclosed]) -> Enclosed:
             used = np.flatnonzero(now)
@@ -372,6 +370,9 @@ class _Forms:
         return formula
 
     def _trace_form_with_slack(self, now: FloatArray, then: FloatArray, level: float) -> _Formula:
+        """Return the matrix of which ``level^2 - |Dz|^2 - tr B'G (G + G' - P)^-1 G'B`` is a Schur complement, in discrete
+        time.  It is affine in both weights but for ``-|Dz|^2``, and the trace is not below ``tr B'PB``: corners suffice."""
+
         def formula(kind: type[Enclosed]) -> Enclosed:
             _, gb, _, dz, slack = self._at(kind, now)
             n, p = gb.shape
