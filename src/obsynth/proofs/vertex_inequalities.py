@@ -370,8 +370,9 @@ class _Forms:
         return formula
 
     def _trace_form_with_slack(self, now: FloatArray, then: FloatArray, level: float) -> _Formula:
-        """Return the matrix of which ``level^2 - |Dz|^2 - tr B'G (G + G' - P)^-1 G'B`` is a Schur complement, in discrete
-        time.  It is affine in both weights but for ``-|Dz|^2``, and the trace is not below ``tr B'PB``: corners suffice."""
+        """Return the matrix with the Schur complement ``level^2 - |Dz|^2 - tr B'G (G + G' - P)^-1 G'B``, discrete time.
+
+        It is affine in both weights but for ``-|Dz|^2``, and no more than with ``tr B'PB``: corners suffice."""
 
         def formula(kind: type[Enclosed]) -> Enclosed:
             _, gb, _, dz, slack = self._at(kind, now)
