@@ -12,7 +12,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from flint import fmpq, fmpq_mat
 
 from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
@@ -20,13 +19,12 @@ from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.nearby_solutions import independent_part, solved_by_lifting
 from obsynth.proofs.witnesses import Dyadic, number_data, root_above, written
 from obsynth.results.design import ObserverDesign
 
 #: Windows with more equations have no exact fractions in a file: their numerators have as many words.
 MOST_EQUATIONS = 400
-#: Diagonal of a pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
-DEPENDENT = 1e-13
 #: Share of a bound that an entry at it counts for when those to correct are chosen.
 LEAST_ROOM = 1e-4
 #: Weights below this share of the largest count as if they were as large.
@@ -176,29 +174,17 @@ def _next_to(
     weight: FloatArray | None = None,
 ) -> list[Fraction] | None:
     """Return ``values + step`` with ``matrix step = missing``, of as few entries as there are independent rows."""
-    from scipy.linalg import qr
-
     if len(matrix) > MOST_EQUATIONS:
         return None
     heavy = np.abs(values) if weight is None else weight
     heavy = heavy if weight is not None else np.maximum(heavy, LEAST_WEIGHT * float(np.max(heavy, initial=0.0)))
-    scaled = matrix * heavy
-    largest = np.abs(scaled).max(axis=1, initial=0.0)
-    scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
-    triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
-    diagonal = np.abs(np.diag(triangle))
-    rank = int(np.sum(diagonal > DEPENDENT * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
-    rows = np.sort(by_row[:rank]).tolist()
-    _, by_column = qr(scaled[rows], mode="r", pivoting=True)
-    columns = np.sort(by_column[:rank]).tolist()
-    part: Any = fmpq_mat(rank, rank, [_rational(exact.get((i, j), Fraction(0))) for i in rows for j in columns])
-    right = fmpq_mat(rank, 1, [_rational(missing[i]) for i in rows])
-    try:
-        step = part.solve(right, algorithm="dixon") if rank else right
-    except ZeroDivisionError:
+    rows, columns = independent_part(matrix, heavy)
+    entries = [exact.get((i, j), Fraction(0)) for i in rows for j in columns]
+    step = solved_by_lifting(entries, [missing[i] for i in rows])
+    if step is None:
         return None
     found = [Fraction(float(value)) for value in values]
-    added = {column: Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k, column in enumerate(columns)}
+    added = dict(zip(columns, step, strict=True))
     kept = set(rows)
     sums = [Fraction(0)] * len(matrix)
     for (i, j), entry in exact.items():
@@ -209,10 +195,6 @@ def _next_to(
     for column, value in added.items():
         found[column] += value
     return found
-
-
-def _rational(value: Fraction) -> Any:
-    return fmpq(value.numerator, value.denominator)
 
 
 def _exact_entries(window: Window) -> Iterator[tuple[int, int, Fraction]]:

@@ -215,6 +215,21 @@ class Scheduling:
         rate = self.rate_of_weight
         return None if rate is None else rate * dt
 
+    def usable_step_of(self, dt: float) -> float | None:
+        """Return the same where a certificate can use it: where the parameter cannot cross its range in a sample."""
+        step = self.step_of(dt)
+        return step if step is not None and step < 1.0 else None
+
+    @property
+    def read_names(self) -> tuple[str, ...]:
+        """The columns of a log that the parameters are read from."""
+        return tuple(self.columns.get(name, name) for name in self.names)
+
+    @property
+    def rated_names(self) -> tuple[str, ...]:
+        """The parameters whose rates are stated."""
+        return tuple(name for name, rate in zip(self.names, self.rates, strict=True) if rate is not None)
+
     @property
     def rate_of_weight(self) -> float | None:
         """By how much the weight of the second of two vertices can change in a second, where it is known."""

@@ -9,7 +9,7 @@ rationals and the other rows are checked.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, TypeAlias
@@ -118,36 +118,50 @@ def rational_correction(
     matrix: FloatArray, weight: FloatArray, exact: list[Fraction]
 ) -> tuple[list[int], list[Fraction]] | None:
     """Return which columns ``matrix step = exact`` is solved by, and the step; ``None`` where there is none."""
-    from scipy.linalg import qr
-
     if len(matrix) > MOST_ROWS_IN_RATIONALS:
         return None
-    scaled = matrix * weight
-    largest = np.abs(scaled).max(axis=1, initial=0.0)
-    scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
-    triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
-    diagonal = np.abs(np.diag(triangle))
-    rank = int(np.sum(diagonal > DEPENDENT_ROW * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
-    rows = np.sort(by_row[:rank])
-    _, by_column = qr(scaled[rows], mode="r", pivoting=True)
-    columns = np.sort(by_column[:rank])
-    entries = matrix[np.ix_(rows, columns)].ravel().tolist()
-    part: Any = fmpq_mat(rank, rank, [fmpq(*value.as_integer_ratio()) for value in entries])
-    right = fmpq_mat(rank, 1, [fmpq(exact[row].numerator, exact[row].denominator) for row in rows])
-    try:
-        # By lifting: the numbers of the solution are long.
-        step = part.solve(right, algorithm="dixon") if rank else right
-    except ZeroDivisionError:
+    rows, columns = independent_part(matrix, weight)
+    entries = [Fraction(value) for value in matrix[np.ix_(rows, columns)].ravel().tolist()]
+    correction = solved_by_lifting(entries, [exact[row] for row in rows])
+    if correction is None:
         return None
-    correction = [Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k in range(rank)]
-    for row in set(range(len(matrix))) - set(rows.tolist()):
+    for row in set(range(len(matrix))) - set(rows):
         product = sum(
             (Fraction(float(matrix[row, c])) * d for c, d in zip(columns, correction, strict=True) if matrix[row, c]),
             start=Fraction(0),
         )
         if product != exact[row]:
             return None
-    return columns.tolist(), correction
+    return columns, correction
+
+
+def independent_part(matrix: FloatArray, weight: FloatArray) -> tuple[list[int], list[int]]:
+    """Return rows and as many columns of a largest nonsingular part of ``matrix (m, n)``, the heavier columns
+    (``weight (n,)``) the better: chosen in double precision."""
+    from scipy.linalg import qr
+
+    scaled = matrix * weight
+    largest = np.abs(scaled).max(axis=1, initial=0.0)
+    scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
+    triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diag(triangle))
+    rank = int(np.sum(diagonal > DEPENDENT_ROW * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
+    rows = np.sort(by_row[:rank]).tolist()
+    _, by_column = qr(scaled[rows], mode="r", pivoting=True)
+    return rows, np.sort(by_column[:rank]).tolist()
+
+
+def solved_by_lifting(entries: Sequence[Fraction], right: Sequence[Fraction]) -> list[Fraction] | None:
+    """Return the exact solution of square equations, entries by rows; ``None`` where they are singular."""
+    count = len(right)
+    part: Any = fmpq_mat(count, count, [fmpq(value.numerator, value.denominator) for value in entries])
+    sides = fmpq_mat(count, 1, [fmpq(value.numerator, value.denominator) for value in right])
+    try:
+        # By lifting: the numbers of the solution are long.
+        solution = part.solve(sides, algorithm="dixon") if count else sides
+    except ZeroDivisionError:
+        return None
+    return [Fraction(int(solution[k, 0].p), int(solution[k, 0].q)) for k in range(count)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,6 +135,12 @@ def witness_of_certificate(
     return Witness(list(P), None if G is None else list(G), None if G is None else pairs)
 
 
+def stored_witness(witness: Witness, names: tuple[str, str] = WITNESSES) -> dict[str, FloatArray]:
+    """Return the matrices of a certificate from which `witness_of_certificate` makes a witness again."""
+    stored = {names[0]: np.array(witness.P)}
+    return stored if witness.G is None else {**stored, names[1]: np.array(witness.G)}
+
+
 def region_gain_row(
     name: str, claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float, *, discrete: bool
 ) -> Check:

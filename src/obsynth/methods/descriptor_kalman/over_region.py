@@ -22,6 +22,7 @@ from obsynth.analysis.existence.kalman import without_unknown_inputs
 from obsynth.analysis.existence.kalman_over_region import free_equations, kalman_conditions_over_region
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
+from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import certified, proved_decay
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
@@ -29,10 +30,9 @@ from obsynth.observers.recursive.steady_filter import steady_state_filter
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
-from obsynth.verification.over_region import WITNESSES, rows_to_forget
+from obsynth.verification.over_region import rows_to_forget, stored_witness
 
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
@@ -57,8 +57,7 @@ def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: 
     progress("checking the existence conditions over the region")
     require_all(kalman_conditions_over_region(plant))
     noise = NoiseOverRegion.of(plant, options["Q"], options["R"])
-    steps = plant.scheduling.step_of(plant.dt)
-    steps = steps if steps is not None and steps < 1.0 else None
+    steps = plant.scheduling.usable_step_of(plant.dt)
     progress("solving the inequalities at the vertices")
     sizes = _sizes(plant, noise)
     T, N = _constant_gains(plant, noise, sizes)
@@ -76,7 +75,7 @@ def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: 
         gains=letters,
         observer=_observer(plant, T, N, gains, decay),
         certificate=Certificate(
-            {"tracking": T, **_stored(claim.witness)}, {"region_deviation": claim.level, "region_decay": decay}
+            {"tracking": T, **stored_witness(claim.witness)}, {"region_deviation": claim.level, "region_decay": decay}
         ),
         solver={"engine": "lmi", "runs": [*certificate.runs, *claim.runs]},
         notes=_notes(plant, decay, steps, noise),
@@ -172,7 +171,6 @@ def _observer(
     first, unseen = plant.vertices[0], np.eye(plant.ny) - plant.vertices[0].C @ N
     By = [T @ vertex.A @ N + S @ unseen for vertex, S in zip(plant.vertices, gains, strict=True)]
     Dy = np.vstack([N, unseen])
-    read = tuple(plant.scheduling.columns.get(name, name) for name in plant.scheduling.names)
     return ScheduledObserver(
         Az=np.array([T @ vertex.A - S @ vertex.C for vertex, S in zip(plant.vertices, gains, strict=True)]),
         Bu=np.array([T @ vertex.B - by @ vertex.D for vertex, by in zip(plant.vertices, By, strict=True)]),
@@ -184,7 +182,7 @@ def _observer(
         scheduling=plant.scheduling,
         forgetting=rows_to_forget(decay),
         dt=plant.dt,
-        input_names=(*plant.input_names, *read),
+        input_names=(*plant.input_names, *plant.scheduling.read_names),
         output_names=plant.output_names,
         state_names=plant.state_names,
         fault_names=(),
@@ -195,28 +193,12 @@ def _observer(
 
 
 def _notes(plant: PolytopicSystem, decay: float, steps: float | None, noise: NoiseOverRegion) -> tuple[str, ...]:
-    notes = [
-        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
-        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
-        f"{rows_to_forget(decay)} rows from the last such row on."
-    ]
+    notes = [certificate_note(plant, f"{rows_to_forget(decay)} rows")]
     if noise.missing:
         notes.append(f"{' and '.join(noise.missing)} = identity, as neither the plant nor the options state the noise.")
-    rated = [
-        name for name, rate in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if rate is not None
-    ]
-    if rated and steps is None:
-        notes.append(
-            f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
-            "sought for one parameter that enters linearly and cannot cross its range within a sample."
-        )
+    notes += unused_rate_notes(plant, steps)
     if plant.nd:
         notes.append("Equations that an unknown input enters are left out: nothing is assumed about it.")
     if plant.nf:
         notes.append("Faults are taken as zero: they show in the innovations.")
     return tuple(notes)
-
-
-def _stored(witness: Witness) -> dict[str, FloatArray]:
-    stored = {WITNESSES[0]: np.array(witness.P)}
-    return stored if witness.G is None else {**stored, WITNESSES[1]: np.array(witness.G)}

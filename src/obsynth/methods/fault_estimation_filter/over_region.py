@@ -16,6 +16,7 @@ from obsynth.analysis.existence.over_region import FilterOverRegion, examine_ove
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SpecError
+from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
@@ -26,7 +27,7 @@ from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
-from obsynth.verification.over_region import WITNESSES, rows_to_forget
+from obsynth.verification.over_region import rows_to_forget, stored_witness
 
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
@@ -47,8 +48,7 @@ def synthesise_over_region(
         raise SpecError("The plant has no filter over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, _, _ = errors_over_region(parts, W)
-    steps = plant.scheduling.step_of(plant.dt)
-    steps = steps if steps is not None and steps < 1.0 else None
+    steps = plant.scheduling.usable_step_of(plant.dt)
     progress("solving the inequalities at the vertices")
     certificate = _certified(errors, method, parts, steps)
     progress("building the realisation and its certificate")
@@ -81,9 +81,7 @@ def _synthesis(
     L = [first + r @ U2.T for first, r in zip(L0, R, strict=True)]
     gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
     observer, tracking = _realised(plant, parts, gains, L, certificate.decay)
-    matrices = {"tracking": tracking, WITNESSES[0]: np.array(certificate.witness.P)}
-    if certificate.witness.G is not None:
-        matrices[WITNESSES[1]] = np.array(certificate.witness.G)
+    matrices = {"tracking": tracking, **stored_witness(certificate.witness)}
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}
     if plant.nd:
         claims |= {
@@ -156,7 +154,6 @@ def _realised(
     for vertex, work, gain in zip(parts.vertices, parts.work, L, strict=True):
         made.append(realise_filter(vertex, work, {**gains, "L": gain}, once))
     first, tracking, _ = made[0]
-    read = tuple(plant.scheduling.columns.get(name, name) for name in plant.scheduling.names)
     each: dict[str, Any] = {
         name: np.array([getattr(observer, name) for observer, _, _ in made]) for name in ("Az", "Bu", "By")
     }
@@ -169,7 +166,7 @@ def _realised(
         scheduling=plant.scheduling,
         forgetting=rows_to_forget(decay),
         dt=plant.dt,
-        input_names=(*plant.input_names, *read),
+        input_names=(*plant.input_names, *plant.scheduling.read_names),
         output_names=plant.output_names,
         state_names=plant.state_names,
         fault_names=plant.fault_names,
@@ -188,19 +185,8 @@ def _rounded_above(value: float) -> float:
 def _notes(
     plant: PolytopicSystem, parts: FilterOverRegion, certificate: VertexCertificate, steps: float | None
 ) -> tuple[str, ...]:
-    notes = [
-        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
-        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
-        f"{rows_to_forget(certificate.decay)} rows from the last such row on."
-    ]
-    rated = [
-        name for name, rate in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if rate is not None
-    ]
-    if rated and steps is None:
-        notes.append(
-            f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
-            "sought for one parameter that enters linearly and cannot cross its range within a sample."
-        )
+    notes = [certificate_note(plant, f"{rows_to_forget(certificate.decay)} rows")]
+    notes += unused_rate_notes(plant, steps)
     if parts.reach != 1.0:
         notes.append(
             f"The effect of the faults changes with the scheduling: the estimates are divided by it, and gamma is the "

@@ -10,7 +10,7 @@ from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
 from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.central_filter import search_least_gain
-from obsynth.numerics.gramians import gramian
+from obsynth.numerics.norms import output_covariance
 from obsynth.observers.linear.observer import LinearObserver
 
 #: A least gain below this share of what disturbances can do is zero but for rounding.
@@ -20,8 +20,7 @@ AS_NOTHING = 1e-9
 def price_in_words(gamma: float, gains: Mapping[str, FloatArray], observer: LinearObserver) -> str:
     """Return gamma, the norm of W and the H2 norm of the fault estimates from unit noise on each output."""
     shown, direct = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
-    covariance = gramian(observer.Az, observer.By @ observer.By.T)
-    noise = float(np.sqrt(np.trace(shown @ covariance @ shown.T + direct @ direct.T)))
+    noise = float(np.sqrt(np.trace(output_covariance(observer.Az, observer.By, shown, direct))))
     return f"gamma {gamma:.5g}, |W| {np.linalg.norm(gains['W'], 2):.4g}, noise {noise:.4g}"
 
 

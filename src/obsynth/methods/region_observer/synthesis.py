@@ -28,7 +28,7 @@ from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.nonlinear_drive import drive_of, wanted_of
 from obsynth.verification.nonlinear_region import corner_errors, corners_of, directions, fastest_decay, whole_gain
-from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, rows_of_euler
+from obsynth.verification.over_region import GAIN_WITNESSES, rows_of_euler, stored_witness
 
 #: Bounds of slopes are stored a little wider: on another processor elementary functions may differ in the last digit.
 SLOPE_ROOM = 1e-9
@@ -281,7 +281,7 @@ def _proved(
     rate = fastest_decay(vertices, witness, _fastest(terms, found.gain))
     if rate < wanted and prove_decay(vertices, found.witness, wanted, discrete=False).proved:
         rate, witness = wanted, found.witness
-    matrices = _stored(witness, WITNESSES)
+    matrices = stored_witness(witness)
     if rate <= 0.0 or rate < wanted:
         raise SolverError(
             "A gain was found, but no decay of the errors could be proved for it over the region. That is no proof "
@@ -290,7 +290,7 @@ def _proved(
     claims = {"region_decay": rate}
     if found.level is None:
         return claims, matrices
-    matrices |= _stored(found.witness, GAIN_WITNESSES)
+    matrices |= stored_witness(found.witness, GAIN_WITNESSES)
     prover, name = (prove_mean_square, "region_deviation") if asked.goal == "power" else (prove_gain, "region_gain")
     for room in PROOF_ROOMS:
         level = found.level * (1.0 + room)
@@ -300,10 +300,6 @@ def _proved(
         "A gain was found, but its certificate could not be proved for the shipped numbers. That is no proof that "
         "there is none: give a smaller region."
     )
-
-
-def _stored(witness: Witness, names: tuple[str, str]) -> dict[str, FloatArray]:
-    return {names[0]: np.array(witness.P), names[1]: np.array(witness.G)}
 
 
 def _fastest(terms: NonlinearTerms, gain: FloatArray) -> float:

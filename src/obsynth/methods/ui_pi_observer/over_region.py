@@ -19,6 +19,7 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_free_gains, pi_over_region
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.rated_certificates import rated_certificate, rated_gains
+from obsynth.methods.engines.region_notes import certificate_note
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified, proved_decay
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
@@ -28,10 +29,9 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
-from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, forgetting_of
+from obsynth.verification.over_region import GAIN_WITNESSES, forgetting_of, stored_witness
 
 #: Options of the observer of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = ("poles", "region", "joint", "E_sharp", "C_sharp", "G", "constraints")
@@ -95,8 +95,7 @@ def _require_options(method: UiPiObserver) -> None:
 
 def _steps(plant: PolytopicSystem) -> float | None:
     """Return how far the weight may move in a sample, where the certificate is to use it."""
-    steps = plant.scheduling.step_of(plant.dt) if plant.is_discrete else None
-    return steps if steps is not None and steps < 1.0 else None
+    return plant.scheduling.usable_step_of(plant.dt) if plant.is_discrete else None
 
 
 def _for_slow_courses(
@@ -150,7 +149,7 @@ def _synthesis(
     required_decay = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
     shrinking = proved_decay(shipped.errors, shipped.none, witness, required=required_decay)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
-    matrices |= _stored(witness, WITNESSES)
+    matrices |= stored_witness(witness)
     claims, runs, slow = {"region_decay": shrinking}, list(certificate.runs), None
     if plant.nf:
         lyapunov = "common" if steps is None else "vertex"
@@ -159,7 +158,9 @@ def _synthesis(
             slow = rated_certificate(shipped.errors, rate, shipped.none, scale=gain.level)
         used = slow if slow is not None and slow.level < gain.level else gain
         slow = slow if used is slow else None
-        matrices |= _stored(gain.witness, GAIN_WITNESSES) if slow is None else {GAIN_WITNESSES[0]: np.array(slow.P)}
+        matrices |= (
+            stored_witness(gain.witness, GAIN_WITNESSES) if slow is None else {GAIN_WITNESSES[0]: np.array(slow.P)}
+        )
         claims["region_gain"] = used.level
         runs += used.runs
     letters = {"U_a": U_a, "D_a": D_a, "Phi": model.Phi, "Cw": model.Cw}
@@ -200,14 +201,8 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def _stored(witness: Witness, names: tuple[str, str]) -> dict[str, FloatArray]:
-    stored = {names[0]: np.array(witness.P)}
-    return stored if witness.G is None else {**stored, names[1]: np.array(witness.G)}
-
-
 def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: float) -> ScheduledObserver:
     first = made[0]
-    read = tuple(plant.scheduling.columns.get(name, name) for name in plant.scheduling.names)
     each: dict[str, Any] = {
         name: np.array([getattr(observer, name) for observer in made]) for name in ("Az", "Bu", "By")
     }
@@ -220,7 +215,7 @@ def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: floa
         scheduling=plant.scheduling,
         forgetting=forgetting_of(rate, discrete=plant.is_discrete),
         dt=plant.dt,
-        input_names=(*plant.input_names, *read),
+        input_names=(*plant.input_names, *plant.scheduling.read_names),
         output_names=plant.output_names,
         state_names=plant.state_names,
         fault_names=plant.fault_names,
@@ -233,11 +228,7 @@ def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: floa
 def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -> tuple[str, ...]:
     forgetting = forgetting_of(rate, discrete=plant.is_discrete)
     for_how_long = f"{forgetting} rows" if plant.is_discrete else f"{forgetting:.4g} s"
-    notes = [
-        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
-        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
-        f"{for_how_long} from the last such row on."
-    ]
+    notes = [certificate_note(plant, for_how_long)]
     if used and not plant.is_discrete:
         notes.append(
             "The gain over the region is proved for courses with the stated rate, by a Lyapunov matrix that moves with "
@@ -251,9 +242,7 @@ def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -
             "norm of the same certificate however long the step is; what such a step misses of the plant's own motion "
             "acts as a disturbance. Rows that are close beside the plant's time constants keep it small."
         )
-    rated = [
-        name for name, known in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if known is not None
-    ]
+    rated = plant.scheduling.rated_names
     if rated and not used:
         notes.append(
             f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "

@@ -1,0 +1,25 @@
+"""What the notes of every design over the region of a polytopic plant say."""
+
+from __future__ import annotations
+
+from obsynth.plants.polytopic import PolytopicSystem
+
+
+def certificate_note(plant: PolytopicSystem, for_how_long: str) -> str:
+    """Return for what the certificate is, and that nothing is claimed ``for_how_long`` after a row outside."""
+    return (
+        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
+        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
+        f"{for_how_long} from the last such row on."
+    )
+
+
+def unused_rate_notes(plant: PolytopicSystem, steps: float | None) -> list[str]:
+    """Return the note that stated rates are not used by the certificate; empty where it uses one, by ``steps``."""
+    rated = plant.scheduling.rated_names
+    if not rated or steps is not None:
+        return []
+    return [
+        f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
+        "sought for one parameter that enters linearly and cannot cross its range within a sample."
+    ]
