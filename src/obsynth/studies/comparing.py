@@ -267,26 +267,20 @@ def side_by_side(
 ) -> Comparison:
     """Return designs side by side, on one clock and on the same draws."""
     report_stage = progress or (lambda _: None)
-    options = {
+    stated_options = {
         "plant": plant.as_dict(),
         "scenario": None if scenario is None else scenario.as_dict(),
         **settings.as_dict(),
     }
     plant = plant.dense() if plant.is_sparse else plant
-    stated = None if scenario is None else scenario.sample_time
-    dt = plant.dt or settings.sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
-    sampled = on_the_clock(plant, dt)
-    happening = _scenario(plant, scenario, dt, settings.disturbance)
-    steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
-    followed, feedback = steps_in_bounds(sampled, steps)
-    if followed < steps:
-        steps, happening = followed, happening.replace(horizon=followed * dt)
+    sampled, trial, loop = _on_one_clock(plant, scenario, settings)
+    dt, (steps, feedback) = sampled.dt, loop
     candidates = source.candidates(plant, sampled, steps, report_stage)
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
         plant,
         sampled,
-        happening,
+        trial,
         runs=settings.runs,
         tolerance=settings.tolerance,
         seed=COMPARISON_SEED,
@@ -294,8 +288,7 @@ def side_by_side(
     )
     logged = None if log is None else log.record(sampled, settings.input_delay)
     limit = settings.within if settings.within is not None else settling_time(plant)
-    bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
-    loop = followed, feedback
+    bounds = largest_disturbances(trial, sampled.disturbance_names, steps, dt)
     compared = _sized(
         [
             _compared(entry, sampled, faulty, healthy, logged, loop, limit, settings.false_alarms, bounds)
@@ -303,29 +296,51 @@ def side_by_side(
         ]
     )
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
-    setting = settings.in_words(plant, dt, happening.horizon, limit, stabilised=bool(feedback.any()))
-    record, truth = (faulty, faulty.truth) if logged is None else (logged, np.array(logged.truth))
-    if logged is not None:
-        # Nobody says what these faults were in the log: zero would be drawn as the truth.
-        truth[:, [name not in logged.known for name in plant.fault_names]] = np.nan
     best = next((entry for entry in compared if not entry.refused), None)
-    settling = settling_time(plant)
-    among = [entry for entry in candidates if entry.figures and "faults" in method_class(entry.method).purposes]
-    usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
+    record, truth = (faulty, faulty.truth) if logged is None else (logged, _known_truth(logged, plant.fault_names))
     reference = None if log is None else log.reference
     return Comparison(
         methods=tuple(compared),
         recommended="" if best is None else best.method,
-        reason=_reason(best, compared, sampled, "" if usual is None else usual.method),
+        reason=_reason(best, compared, sampled, _method_by_default(candidates, sampled, settling_time(plant))),
         sample_time=dt,
         times=read_only(record.times),
         truth=read_only(truth),
         fault_names=plant.fault_names,
-        setting=setting,
-        asked=options if log is None or reference is not None else {},
+        setting=settings.in_words(plant, dt, trial.horizon, limit, stabilised=bool(feedback.any())),
+        asked=stated_options if log is None or reference is not None else {},
         log=reference,
         notes=() if logged is None else logged.notes,
     )
+
+
+def _on_one_clock(
+    plant: DescriptorSystem, scenario: Scenario | None, settings: ComparisonSettings
+) -> tuple[DescriptorSystem, Scenario, tuple[int, FloatArray]]:
+    """Return the sampled plant, the scenario, and samples and feedback of a run (an unstable plant is stabilised)."""
+    stated = None if scenario is None else scenario.sample_time
+    dt = plant.dt or settings.sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
+    sampled = on_the_clock(plant, dt)
+    trial = _scenario(plant, scenario, dt, settings.disturbance)
+    steps = int(min(trial.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
+    within_bounds, feedback = steps_in_bounds(sampled, steps)
+    if within_bounds < steps:
+        trial = trial.replace(horizon=within_bounds * dt)
+    return sampled, trial, (within_bounds, feedback)
+
+
+def _known_truth(logged: Record, fault_names: Sequence[str]) -> FloatArray:
+    """Return the faults of a log, NaN where nobody says what they were: zero would be drawn as the truth."""
+    truth = np.array(logged.truth)
+    truth[:, [name not in logged.known for name in fault_names]] = np.nan
+    return truth
+
+
+def _method_by_default(candidates: Sequence[Candidate], sampled: DescriptorSystem, settling: float) -> str:
+    """Return the method that `design` takes by default among those that estimate faults."""
+    among = [entry for entry in candidates if entry.figures and "faults" in method_class(entry.method).purposes]
+    first = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
+    return "" if first is None else first.method
 
 
 def compared_again(

@@ -22,6 +22,8 @@ from obsynth.studies.verbs.sweeps import chosen_executor
 if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor
     from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
+    from obsynth.results.design import ObserverDesign
+    from obsynth.simulation.scenario import Scenario
 
 
 def _run_tolerances(options: argparse.Namespace) -> int:
@@ -83,10 +85,8 @@ def _tolerance(text: str) -> float | str:
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
-    from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
-    from obsynth.monitoring.thresholds.residual_monitor import monitor
-    from obsynth.observers.linear.observer import LinearObserver
     from obsynth.studies.evaluate import evaluate
+    from obsynth.studies.tables import evaluation_report
 
     if options.tolerances is not None:
         return _run_tolerances(options)
@@ -96,18 +96,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         spec, scenario, _, design = prepared(options, report_stage)
         report_stage("running")
-
-        watched: Monitor | ParameterMonitor | None = None
-        if options.monitor is not None and isinstance(design.observer, LinearObserver):
-            watched = monitor(design, scenario, options.monitor, **monitor_settings(design, options))
-        elif options.monitor is not None:
-            table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
-            refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
-            watched = ParameterMonitor(
-                options.monitor,
-                false_alarms=options.false_alarms or FALSE_ALARMS,
-                change=(options.change or CHANGE) if options.monitor == "cusum" else None,
-            )
+        watched = _chosen_monitor(options, design, scenario)
         with chosen_executor(options.jobs, None) as executor:
             evaluation = evaluate(
                 design,
@@ -119,25 +108,13 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 plants=options.plants,
                 **({} if options.confidence is None else {"confidence": options.confidence}),
             )
-    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving
-    from obsynth.studies.tables import described, evaluation_report, final_threshold
-
-    least = design_beside_least(design, scenario)
-    units, moving = design.plant.units, bool(least) and is_moving(design)
-    noisy = bool(least) and bool(design.linear[0].Dw.any() or design.linear[0].Bw.any())
-    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving, noisy=noisy) for name, pair in least.items()]
-    monitor_data: dict[str, Any] | None = None
-    if watched is not None:
-        kind, statement = described(watched)
-        monitor_data = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
+    least_data, sentences = _least_thresholds(design, scenario)
     emit(
         options,
         {
             "spec": spec.path,
-            "monitor": monitor_data,
-            "least_thresholds": {
-                name: {"bound": pair[0], "least": pair[1], "moving": moving} for name, pair in least.items()
-            },
+            "monitor": _monitor_data(watched),
+            "least_thresholds": least_data,
             **evaluation.as_dict(),
         },
         lambda: evaluation_report(
@@ -150,6 +127,51 @@ def run_evaluate(options: argparse.Namespace) -> int:
         ),
     )
     return 0
+
+
+def _chosen_monitor(
+    options: argparse.Namespace, design: ObserverDesign, scenario: Scenario
+) -> Monitor | ParameterMonitor | None:
+    """Return the monitor that ``--monitor`` names, if any, as its other options set it."""
+    from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
+    from obsynth.monitoring.thresholds.residual_monitor import monitor
+    from obsynth.observers.linear.observer import LinearObserver
+
+    if options.monitor is None:
+        return None
+    if isinstance(design.observer, LinearObserver):
+        return monitor(design, scenario, options.monitor, **monitor_settings(design, options))
+    refuse_idle(
+        {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}, options.monitor, stated_settings(options), called=flag_of
+    )
+    return ParameterMonitor(
+        options.monitor,
+        false_alarms=options.false_alarms or FALSE_ALARMS,
+        change=(options.change or CHANGE) if options.monitor == "cusum" else None,
+    )
+
+
+def _monitor_data(watched: Monitor | ParameterMonitor | None) -> dict[str, Any] | None:
+    from obsynth.studies.tables import described, final_threshold
+
+    if watched is None:
+        return None
+    kind, statement = described(watched)
+    return {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
+
+
+def _least_thresholds(design: ObserverDesign, scenario: Scenario) -> tuple[dict[str, Any], list[str]]:
+    """Return each fault's bound beside the least possible one, as data and as sentences."""
+    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving
+
+    least = design_beside_least(design, scenario)
+    if not least:
+        return {}, []
+    (plant, _), units, moving = design.linear, design.plant.units, is_moving(design)
+    noisy = bool(plant.Dw.any() or plant.Bw.any())
+    data = {name: {"bound": bound, "least": lowest, "moving": moving} for name, (bound, lowest) in least.items()}
+    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving, noisy=noisy) for name, pair in least.items()]
+    return data, sentences
 
 
 def run_compare(options: argparse.Namespace) -> int:
