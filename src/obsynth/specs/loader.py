@@ -217,13 +217,9 @@ def spec_of(
     checked, raw_options = checked_spec(document, source)
     reference: Any = checked.plant if hasattr(checked.plant, "file") else None
     section, plant_source, prefix, from_mat = _plant_section(checked.plant, source, plant_changes or {})
-    problems = DocumentProblems(source, what="spec")
-    options = {
-        name: read_value(value, source.parent, f"method.options.{name}", problems)
-        for name, value in raw_options.items()
-    }
-    problems.raise_if_any()
-    plant, transformation = built_plant(section, plant_source, prefix) if from_mat is None else from_mat, None
+    options = _options_as_read(raw_options, source)
+    plant = built_plant(section, plant_source, prefix) if from_mat is None else from_mat
+    transformation: Transformation | None = None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
     transform: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
     if reference is not None and reference.transform is not None:
@@ -242,18 +238,13 @@ def spec_of(
             path="plant.transform.linearise",
         )
     if isinstance(plant, DescriptorSystem):
-        noisy: Any = None
+        noisy, variances = None, {}
         if states and model is None:
-            noisy, more = _placed_noise(plant, noise, plant_source, prefix)
-            transformation, plant = noisy, noisy.plant
-        if transform[0] is not None or plant.delays:
-            with one_thread_if_small(plant.nx):
-                later = _transformed(transform[0], plant, *transform[1:])
-            if later is not None:
-                transformation = later if transformation is None else transformation.then(later)
+            noisy, variances = _placed_noise(plant, noise, plant_source, prefix)
+        transformation = _steps_of_linear_plant(plant, noisy, transform)
         plant = plant if transformation is None else transformation.plant
         if noisy is not None and plant.state_names == noisy.plant.state_names:
-            options = _with_options(options, more, checked.method.id)
+            options = _with_options(options, variances, checked.method.id)
     elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "
@@ -274,6 +265,31 @@ def spec_of(
         noise=noise or None,
         inputs=_checked_inputs(checked.inputs, plant, source),
     )
+
+
+def _options_as_read(raw_options: Mapping[str, Any], source: Path) -> dict[str, Any]:
+    """Return the options of the method with matrices read from the files that they name."""
+    problems = DocumentProblems(source, what="spec")
+    options = {
+        name: read_value(value, source.parent, f"method.options.{name}", problems)
+        for name, value in raw_options.items()
+    }
+    problems.raise_if_any()
+    return options
+
+
+def _steps_of_linear_plant(
+    plant: DescriptorSystem, noisy: Transformation | None, transform: tuple[TransformSection | None, Path, str]
+) -> Transformation | None:
+    """Return states for noise, then what the spec asks for, as one transformation; ``None`` where there is neither."""
+    before = plant if noisy is None else noisy.plant
+    if transform[0] is None and not before.delays:
+        return noisy
+    with one_thread_if_small(before.nx):
+        later = _transformed(transform[0], before, *transform[1:])
+    if later is None or noisy is None:
+        return noisy if later is None else later
+    return noisy.then(later)
 
 
 def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tuple[Any, Path, str, Any]:
