@@ -13,8 +13,8 @@ from benchmarks.campaigns import frame  # noqa: E402
 PARTS = 4
 
 
-#: A case of these takes minutes.
-LONG = {"logs_as_they_are"}
+#: A case of these takes many seconds.
+LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers"}
 NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in frame.campaign_names()]
 
 

@@ -42,6 +42,7 @@ def test_mean_of_the_fault_estimation_filter() -> None:
     assert [check.name for check in broken.failures][:1] == ["mean"]
 
 
+@pytest.mark.long
 def test_a_step_that_is_not_reached_is_said() -> None:
     source = load_spec(DESIGNS / "smib" / "functional.yaml").transformation.source
     design = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(source).plant)

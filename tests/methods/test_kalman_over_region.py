@@ -193,6 +193,7 @@ def test_noise_of_the_plant_counts_at_every_vertex() -> None:
         obsynth.descriptor_kalman(oscillator(Bw=[["1 + 0.5 * v"], [0]], Dw=[[0.3]]))
 
 
+@pytest.mark.long
 def test_a_rate_buys_a_smaller_mean_square() -> None:
     def made(rate: float | None) -> float:
         given = oscillator().as_dict()["plant"]

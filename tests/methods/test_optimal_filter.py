@@ -188,6 +188,7 @@ def test_a_plant_without_noise_in_continuous_time_gets_the_noise_that_its_digits
         obsynth.optimal_filter(case, decoupled="disturbance")  # s = 1/2
 
 
+@pytest.mark.long
 def test_the_noise_that_is_offered_closes_the_gap() -> None:
     case = obsynth.load_spec(DESIGNS / "sharepasand" / "spec.yaml").plant
     options = {"reference": {"bandwidth": 1.0, "order": 2}}
@@ -266,6 +267,7 @@ def test_each_fault_has_its_own_delay() -> None:
     assert "fault map" in {check.name for check in obsynth.verify(later).failures}
 
 
+@pytest.mark.long
 def test_delays_that_are_open_are_as_short_as_the_gain_allows() -> None:
     design = obsynth.optimal_filter(TWO_DELAYS, delay={"f1": "auto", "f2": "auto"})
     assert design.report.passed

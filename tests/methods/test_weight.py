@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -77,3 +79,107 @@ def test_another_weight_than_the_paper_s_fails_its_row():
     free = obsynth.fault_estimation_filter(plant, weight="free")
     report = obsynth.verify(free.replace(options={**free.options, "weight": "paper"}))
     assert "gains: paper's W" in {check.name for check in report.failures}
+
+
+def _left_inverses(plant: obsynth.DescriptorSystem, count: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return Upsilon and some left inverses of it that are not its pseudoinverse."""
+    upsilon = obsynth.conditions.wang2015(plant).data["Upsilon"]
+    rng, (nf, ny) = np.random.default_rng(47), upsilon.T.shape
+    free = np.linalg.svd(upsilon)[0][:, nf:].T
+    return upsilon, [np.linalg.pinv(upsilon) + rng.normal(size=(nf, ny - nf)) @ free for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_given_weight_is_kept_and_its_gain_is_that_of_the_inequality(name):
+    plant = obsynth.DescriptorSystem(**PLANTS[name], dt=1.0)
+    for weight in _left_inverses(plant, 2)[1]:
+        ours = obsynth.fault_estimation_filter(plant, weight=weight)
+        assert ours.report["gains: given W"].passed
+        np.testing.assert_allclose(ours.gains["W"], weight, rtol=0, atol=1e-12)
+        inequality = obsynth.conditions.wang2015(plant, W=weight)
+        inequality.problem.solve(solver="CLARABEL")
+        least = np.sqrt(inequality.variables["gamma_squared"].value)
+        assert ours.certificate.claims["gamma_min"] == pytest.approx(least, rel=1e-5)
+
+
+def test_a_given_weight_is_kept_where_the_inequality_has_something_else_in_it():
+    plant = obsynth.DescriptorSystem(**PLANTS["Wang 2015"], dt=1.0)
+    (weight,) = _left_inverses(plant, 1)[1]
+    ours = obsynth.fault_estimation_filter(plant, weight=weight, decay=0.01)
+    assert ours.report["gains: given W"].passed
+    np.testing.assert_allclose(ours.gains["W"], weight, rtol=0, atol=1e-12)
+
+
+def test_a_given_weight_may_be_short_of_its_last_digits():
+    plant = obsynth.DescriptorSystem(**PLANTS["Wang 2015"], dt=1.0)
+    upsilon, (weight,) = _left_inverses(plant, 1)
+    ours = obsynth.fault_estimation_filter(plant, weight=np.round(weight, 10))
+    assert ours.report.passed
+    np.testing.assert_allclose(ours.gains["W"] @ upsilon, np.eye(2), rtol=0, atol=1e-14)
+
+
+def test_a_given_weight_of_outputs_in_other_units():
+    outputs = np.array([1e3, 1.0, 1e-6])[:, None] * np.array(PLANTS["Wang 2015"]["C"])
+    plant = obsynth.DescriptorSystem(**{**PLANTS["Wang 2015"], "C": outputs}, dt=1.0)
+    (weight,) = _left_inverses(plant, 1)[1]
+    ours = obsynth.fault_estimation_filter(plant, weight=weight)
+    np.testing.assert_allclose(ours.gains["W"], weight, rtol=1e-9)
+    inequality = obsynth.conditions.wang2015(plant, W=weight, coordinates="balanced")
+    inequality.problem.solve(solver="CLARABEL")
+    least = np.sqrt(inequality.variables["gamma_squared"].value)
+    assert ours.certificate.claims["gamma_min"] == pytest.approx(least, rel=1e-5)
+
+
+def test_a_spec_may_state_the_weight_and_the_gain_set_keeps_it(tmp_path):
+    plant = obsynth.DescriptorSystem(**PLANTS["three states"], dt=1.0)
+    (weight,) = _left_inverses(plant, 1)[1]
+    sections = {name: np.array(value).tolist() for name, value in PLANTS["three states"].items()}
+    document = {
+        "schema_version": 1,
+        "name": "given",
+        "plant": {"dt": 1.0, **sections},
+        "method": {"id": "fault-estimation-filter", "options": {"weight": weight.tolist()}},
+    }
+    file = tmp_path / "spec.yaml"
+    file.write_text(json.dumps(document), encoding="utf-8")
+    spec = obsynth.load_spec(file)
+    design = obsynth.design(spec.plant, spec.method, **spec.options)
+    again = obsynth.load(design.save(tmp_path / "given.gains.json"))
+    assert again.options["weight"] == weight.tolist()
+    assert obsynth.verify(again)["gains: given W"].passed
+
+
+@pytest.mark.parametrize("stored", [[[1.0, 0.0, 0.0]], [["a"]], "W", [[None, 0.0, 0.0]], {}, 1.0])
+def test_a_stored_weight_that_is_not_w_fails_its_row(stored):
+    plant = obsynth.DescriptorSystem(**PLANTS["three states"], dt=1.0)
+    design = obsynth.fault_estimation_filter(plant, weight=_left_inverses(plant, 1)[1][0])
+    report = obsynth.verify(design.replace(options={**design.options, "weight": stored}))
+    assert "gains: given W" in {check.name for check in report.failures}
+
+
+@pytest.mark.parametrize(
+    ("weight", "words"),
+    [
+        (1.01 * np.array([[0.0, 0.0, 0.5]]), "misses the identity"),
+        (np.zeros((2, 3)), "2 by 3, but 1 by 3"),
+        ("papers", "give 'paper', 'free' or a matrix"),
+        (2.0, "give 'paper', 'free' or a matrix"),
+        ([["a", 0, 0]], "give 'paper', 'free' or a matrix"),
+        ([[np.nan, 0, 0]], "must be finite"),
+    ],
+)
+def test_what_is_no_left_inverse_of_upsilon_is_refused(weight, words):
+    plant = obsynth.DescriptorSystem(**PLANTS["three states"], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match=words):
+        obsynth.fault_estimation_filter(plant, weight=weight)
+
+
+def test_a_given_weight_has_no_limit_beside_it_and_needs_independent_outputs():
+    plant = obsynth.DescriptorSystem(**PLANTS["three states"], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match="needs a free weight"):
+        obsynth.fault_estimation_filter(plant, weight=[[0.0, 0.0, 0.5]], residual_weight_limit=3.0)
+    twice = obsynth.DescriptorSystem(
+        **{**PLANTS["three states"], "C": [*PLANTS["three states"]["C"], [0, 0, 1]]}, dt=1.0
+    )
+    with pytest.raises(obsynth.PreconditionError, match="A given W is for independent outputs"):
+        obsynth.fault_estimation_filter(twice, weight=[[0.0, 0.0, 0.5, 0.0]])

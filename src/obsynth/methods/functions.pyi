@@ -18,7 +18,7 @@ def fault_estimation_filter(
     gamma: float | None = ...,
     gamma_search: Literal["direct", "bisection"] = ...,
     gamma_margin: float = ...,
-    weight: Literal["paper", "free"] | None = ...,
+    weight: Any = ...,
     residual_weight_limit: float | None = ...,
     S: Any = ...,
     engine: Literal["auto", "riccati", "lmi"] = ...,

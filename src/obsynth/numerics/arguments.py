@@ -348,6 +348,10 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
         )
     if kind == "named bounds" and is_number(value):
         return _problem_with_bound(value, name)
+    if kind == "residual weight":
+        fits = value is None or (isinstance(value, str) and value in ("paper", "free")) or _is_one_of(value, _Numbers)
+        fits = fits and not is_number(value) and not isinstance(value, (bool, np.bool_))
+        return None if fits else f"{name} is {shown(value)}: give 'paper', 'free' or a matrix (nf, ny)."
     if kind == "delay":
         each = value.values() if isinstance(value, Mapping) else value
         each = [value] if isinstance(each, str) or not isinstance(each, Iterable) else [*each]

@@ -232,6 +232,12 @@ Covariance = Annotated[
     Discriminator(lambda value: _NUMBER_TAG if is_number(value) else FILE_TAG if isinstance(value, dict) else _ROWS),
 ]
 
+#: The residual weight of Wang's filter: by name, or a matrix.
+ResidualWeight = Annotated[
+    Annotated[Literal["paper", "free"], Tag(ONE_TAG)] | Rows | Annotated[MatrixFile, Tag(FILE_TAG)],
+    Discriminator(lambda value: FILE_TAG if isinstance(value, dict) else _ROWS if isinstance(value, list) else ONE_TAG),
+]
+
 VaryingCovariance = Annotated[
     Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)],
     Discriminator(lambda value: _NUMBER_TAG if is_number(value) else kind_of_varying_matrix(value)),
@@ -285,6 +291,7 @@ def _with_floats(value: Any) -> Any:
 #: What a document may write for an option that is no plain number, text or truth.
 OPTION_KINDS: Mapping[str, Any] = {
     "matrix": Matrix | None,
+    "residual weight": ResidualWeight | None,
     "covariance": Covariance | None,
     "varying covariance": VaryingCovariance | None,
     "vector": list[float] | None,

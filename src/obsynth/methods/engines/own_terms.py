@@ -62,7 +62,7 @@ def filter_by_inequality(
     progress("checking the existence conditions")
     require_all(fault_filter_conditions(plant))
     free = bool(method.asks_for_free_weight)
-    problem = wang2015(plant, S=method.S, W="free" if free else None, gamma=None)
+    problem = wang2015(plant, S=method.S, W="free" if free else method.given_weight, gamma=None)
     squared, P, Y = problem.variables["gamma_squared"], problem.variables["P"], problem.variables["Y"]
     parts = [] if method.region is None else [checked_region(method.region)]
     if method.decay is not None:
@@ -115,7 +115,8 @@ def filter_by_inequality(
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
         made = replace(made, observer=averaged(made.observer, method.mean), certificate=Certificate(matrices, claims))
-    return _recorded(made, method, problem, runs, where, weight="free" if free else "paper")
+    taken = "free" if free else "paper" if method.given_weight is None else method.given_weight.tolist()
+    return _recorded(made, method, problem, runs, where, weight=taken)
 
 
 def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:

@@ -16,8 +16,8 @@ from obsynth.methods.fault_estimation_filter.checks_over_region import checks_ov
 from obsynth.methods.fault_estimation_filter.printed_gains import (
     gain_rows,
     gains_fit,
-    paper_weight_row,
     printed_allowances,
+    weight_rows,
 )
 from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
@@ -120,8 +120,8 @@ def _gain_set_rows(
     equations = Equations.of(plant, work, observer.fault_delays)
     options = design.options
     yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
-    if options.get("weight") == "paper" and decide_rank(work.C).rank == work.ny:
-        yield paper_weight_row(gains)
+    if options.get("weight") != "paper" or decide_rank(work.C).rank == work.ny:
+        yield from weight_rows(gains, options.get("weight"))
     yield from _least_gain(design, work)
     return allowances
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
-from obsynth.errors import InfeasibleError
+from obsynth.errors import InfeasibleError, SpecError
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit, null_basis
+from obsynth.numerics.ranks import RANK_TOLERANCE
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
@@ -84,10 +86,35 @@ def gains_in_given_units(prepared: PreparedPlant, parts: GainParts, chosen: Inje
     }
 
 
-def centred(problem: GainProblem, prepared: PreparedPlant, parts: GainParts) -> tuple[GainProblem, GainParts]:
-    """Return the problem written so that V = 0 is the W of least norm in the user's output units, not balanced ones."""
+def left_inverse_near(weight: FloatArray, upsilon: FloatArray, path: str) -> FloatArray:
+    """Return the left inverse of Upsilon next to a given one, whose last digits may be missing.
+
+    Raises
+    ------
+    SpecError
+        The weight has another shape, or ``W Upsilon`` is not the identity.
+    """
+    require_shape(weight.shape, upsilon.T.shape, path)
+    missed = np.eye(upsilon.shape[1]) - weight @ upsilon
+    share = float(np.max(np.abs(missed) / np.maximum(np.abs(weight) @ np.abs(upsilon), 1.0), initial=0.0))
+    if not share <= RANK_TOLERANCE:
+        raise SpecError(
+            f"{path}: W Upsilon misses the identity by {share:.3g}: give a left inverse of Upsilon in all its digits. "
+            f"With the T of this design Upsilon is {np.round(upsilon, 6).tolist()}.",
+            path=path,
+        )
+    return np.asarray(weight + missed @ _left_inverse(upsilon))
+
+
+def centred(
+    problem: GainProblem, prepared: PreparedPlant, parts: GainParts, *, weight: FloatArray | None = None
+) -> tuple[GainProblem, GainParts]:
+    """Return the problem written so that V = 0 is a given W, or the one of least norm in the user's output units, not
+    balanced ones."""
     outputs = prepared.scaling.outputs
-    w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
+    upsilon = prepared.detectability.Upsilon / outputs[:, None]
+    own = _left_inverse(upsilon) if weight is None else left_inverse_near(weight, upsilon, "method.options.weight")
+    w0 = own / outputs
     v = (w0 - parts.W0) @ parts.V
     moved = replace(problem, Z=problem.Z + v @ problem.C, Zd=problem.Zd + v @ problem.D, Zn=problem.Zn + v @ problem.Dn)
     return moved, replace(parts, W0=w0)

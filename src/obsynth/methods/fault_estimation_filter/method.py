@@ -20,7 +20,7 @@ from obsynth.conditions.options import (
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
-from obsynth.numerics.arrays import require_no_overflow
+from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
@@ -55,10 +55,12 @@ class FaultEstimationFilter(Method):
     gamma_margin : float, optional
         Relative distance to the least gain that buys small gains, or little noise where the plant states noise; the
         bare optimum is badly conditioned.
-    weight : {"paper", "free"}, optional
+    weight : {"paper", "free"} or array_like, optional
         Residual weight W: ``"paper"`` is W = Upsilon^+ of Theorem 2 in the outputs as given; ``"free"`` any W with ``W
-        Upsilon = I``, of little noise for the gamma that is shipped.  By default the free one, unless no noise is
-        stated and it lowers the least gamma by less than 5 %; a note gives both.  With S or bisection the paper's.
+        Upsilon = I``, of little noise for the gamma that is shipped; or a matrix ``(nf, ny)`` with ``W Upsilon = I``,
+        in units of faults by outputs (``gains["Upsilon"]`` of any design with the same T).  By default the free one,
+        unless no noise is stated and it lowers the least gamma by less than 5 %; a note gives both.  With S or
+        bisection the paper's.
     residual_weight_limit : float, optional
         Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
@@ -112,7 +114,7 @@ class FaultEstimationFilter(Method):
     Raises
     ------
     SpecError
-        An option is out of range or S has the wrong shape.
+        An option is out of range, S or W has the wrong shape, or ``W Upsilon`` is not the identity.
     PreconditionError
         ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that reaches no output, ``rank Upsilon <
         nf`` (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
@@ -169,7 +171,7 @@ class FaultEstimationFilter(Method):
     gamma: Positive | None = None
     gamma_search: Literal["direct", "bisection"] = "direct"
     gamma_margin: Annotated[float, Ge(LEAST_MARGIN)] = 0.05
-    weight: Literal["paper", "free"] | None = None
+    weight: Annotated[Any, WrittenAs("residual weight")] = None
     residual_weight_limit: Positive | None = None
     S: Annotated[Any, WrittenAs("matrix")] = None
     engine: Literal["auto", "riccati", "lmi"] = "auto"
@@ -190,8 +192,8 @@ class FaultEstimationFilter(Method):
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
-        if self.weight == "paper" and self.residual_weight_limit is not None:
-            yield "residual_weight_limit needs a free weight: leave weight: paper out."
+        if self.weight is not None and not self._is_free and self.residual_weight_limit is not None:
+            yield "residual_weight_limit needs a free weight: leave weight out, or set weight: free."
         if self.residual_weight_limit is not None and self.engine == "riccati":
             yield "residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'."
         if self.objective is not None and "objective" not in own_terms(self):
@@ -203,11 +205,22 @@ class FaultEstimationFilter(Method):
             yield "engine 'riccati' imposes no decay: use 'auto' or 'lmi'."
 
     @property
+    def _is_free(self) -> bool:
+        return isinstance(self.weight, str) and self.weight == "free"
+
+    @property
     def asks_for_free_weight(self) -> bool | None:
         """Whether W is asked to be free; ``None``: nothing is said of it."""
-        if self.weight is not None or self.residual_weight_limit is not None:
-            return self.weight != "paper"
+        if self.weight is not None:
+            return self._is_free
+        if self.residual_weight_limit is not None:
+            return True
         return False if self.S is not None or self.gamma_search == "bisection" else None
+
+    @property
+    def given_weight(self) -> FloatArray | None:
+        """The matrix W ``(nf, ny)`` that is given, if one is."""
+        return None if self.weight is None or isinstance(self.weight, str) else as_matrix(self.weight, "weight")
 
     @property
     def own_inequality(self) -> bool:

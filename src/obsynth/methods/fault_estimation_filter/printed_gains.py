@@ -17,6 +17,7 @@ from obsynth.methods.fault_estimation_filter.whole_transfer import (
     step_key,
 )
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -30,8 +31,12 @@ NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
 
+PAPER_WEIGHT, GIVEN_WEIGHT = "gains: paper's W", "gains: given W"
+
 #: W repeats the pseudoinverse to this share of its rows.
 PSEUDOINVERSE_SHARE = 1e-8
+#: W repeats a given matrix to this share of its rows: the digits that it may miss of a left inverse.
+GIVEN_SHARE = 10.0 * RANK_TOLERANCE
 
 #: The gains that are printed; Psi, Upsilon and R follow from them.
 PRINTED = "TNLW"
@@ -155,20 +160,37 @@ def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray
     ]
 
 
-def paper_weight_row(gains: Mapping[str, FloatArray]) -> Check:
-    """Return the row that W is the paper's, the left inverse of Upsilon of least norm."""
+def weight_rows(gains: Mapping[str, FloatArray], weight: object) -> Iterator[Check]:
+    """Yield the row that W is the one that the options name: the paper's, or a matrix; of a free one there is none."""
     upsilon = gains["Upsilon"]
-    units = np.linalg.norm(upsilon, axis=0)
-    pseudoinverse = np.linalg.pinv(upsilon / units) / units[:, None]
-    size = np.max(np.abs(pseudoinverse), axis=1, initial=0.0, keepdims=True)
-    return upper_bound_check(
-        "gains: paper's W",
-        "W is the pseudoinverse of Upsilon, for the outputs as they are: relative difference",
-        float(np.max(np.abs(gains["W"] - pseudoinverse) / size, initial=0.0)),
-        PSEUDOINVERSE_SHARE,
-        source="Wang 2015, eq. (47)",
+    if weight is None or weight == "free":
+        return
+    if weight == "paper":
+        units = np.linalg.norm(upsilon, axis=0)
+        name, named = PAPER_WEIGHT, np.linalg.pinv(upsilon / units) / units[:, None]
+        claim = "W is the pseudoinverse of Upsilon, for the outputs as they are: relative difference"
+    else:
+        name, named = GIVEN_WEIGHT, _as_weight(weight, gains["W"].shape)
+        claim = "W is the matrix that was given: relative difference"
+    size = np.max(np.abs(named), axis=1, initial=0.0, keepdims=True)
+    difference = np.abs(gains["W"] - named) / np.where(size > 0.0, size, 1.0)
+    yield upper_bound_check(
+        name,
+        claim,
+        float(np.max(difference, initial=0.0)),
+        PSEUDOINVERSE_SHARE if weight == "paper" else GIVEN_SHARE,
+        source="Wang 2015, eq. (47)" if weight == "paper" else "option weight",
         kind="equality",
     )
+
+
+def _as_weight(weight: object, shape: tuple[int, ...]) -> FloatArray:
+    """Return a stored weight as an array; NaN, which no W equals, where it is none of this shape."""
+    try:
+        given = np.array(weight, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    return given if given.shape == shape else np.full(shape, np.nan)
 
 
 def printed_allowances(

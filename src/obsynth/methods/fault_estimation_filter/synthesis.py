@@ -40,7 +40,7 @@ from obsynth.methods.fault_estimation_filter.convex_problem import (
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_region
-from obsynth.methods.fault_estimation_filter.printed_gains import paper_weight_row
+from obsynth.methods.fault_estimation_filter.printed_gains import weight_rows
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
@@ -93,6 +93,8 @@ def synthesise(
         return made if near is None else _less_noisy(plant, near, made, method, progress)
     if method.S is not None:
         raise _for_independent_outputs("S", "S", plant, merged)
+    if method.given_weight is not None:
+        raise _for_independent_outputs("A given W", "weight", plant, merged)
     made = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, method, progress))
     if not _is_as_labelled(made):
         if paper:
@@ -138,7 +140,7 @@ def _for_independent_outputs(
 
 def _is_as_labelled(made: Synthesis) -> bool:
     """Whether W is the paper's where the options say so."""
-    return made.options["weight"] == "free" or paper_weight_row(made.gains).passed
+    return all(row.passed for row in weight_rows(made.gains, made.options["weight"]))
 
 
 def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthesis) -> Synthesis:
@@ -177,7 +179,7 @@ def _synthesised(
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
     if not free or limit is not None:
         # The paper's W = Upsilon^+ is that of the outputs as given, not of balanced ones.
-        problem, parts = centred(problem, prepared, parts)
+        problem, parts = centred(problem, prepared, parts, weight=method.given_weight)
     elif plant.nw == 0:
         problem = with_output_noise(problem, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
@@ -200,7 +202,8 @@ def _synthesised(
         claims = {"gamma": level, "gamma_min": least["gamma_min"]} | claims | least
         witnesses |= proof
     records = [*outcome.least.records, *outcome.records]
-    resolved = method.as_plain() | {"weight": "free" if free else "paper", "S": None if s is None else s.tolist()}
+    taken = "free" if free else "paper" if method.given_weight is None else method.given_weight.tolist()
+    resolved = method.as_plain() | {"weight": taken, "S": None if s is None else s.tolist()}
     if other is not None:
         both = {free: price_in_words(level, gains, observer), not free: other}
         remarks = (*remarks, f"{_PRICES} Free W: {both[True]}. The paper's W: {both[False]}.")
