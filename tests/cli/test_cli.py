@@ -163,6 +163,7 @@ class TestDesign:
 
 
 class TestWidths:
+    @pytest.mark.one_in(3)
     @pytest.mark.parametrize("width", [72, 80, 120, 200])
     @pytest.mark.parametrize(
         "arguments", [["verify", "-v"], ["check", "-v", "--system", str(SMIB)]], ids=["verify", "check"]
@@ -359,12 +360,14 @@ class TestRealProcesses:
         assert "zero z = -1" in done.stderr
         assert "Traceback" not in done.stderr
 
+    @pytest.mark.long
     def test_an_ascii_terminal(self, tmp_path: Path) -> None:
         (tmp_path / "spec.yaml").write_text(CONTINUOUS, encoding="utf-8")
         done = run("design", "--system", "spec.yaml", env={"PYTHONIOENCODING": "ascii"})
         assert done.returncode == 0, done.stderr
         assert "tor\\u03c4ue" in done.stdout
 
+    @pytest.mark.long
     def test_a_reader_that_leaves(self, wang_gains: Path) -> None:
         command = [sys.executable, "-m", "obsynth", "verify", str(wang_gains)]
         environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
@@ -376,6 +379,7 @@ class TestRealProcesses:
         assert process.returncode == 141
         assert said == b""
 
+    @pytest.mark.long
     def test_progress_on_a_terminal_disappears(self, tmp_path: Path) -> None:
         here, there = os.openpty()
         environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "TERM": "xterm"}

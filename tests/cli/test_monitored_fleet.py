@@ -81,6 +81,7 @@ def test_thresholds_that_are_missing_are_told(place: Path, tmp_path: Path):
         obsynth.run_fleet(place / "gains", place / "logs", tmp_path / "o2", normal=place / "normal")
 
 
+@pytest.mark.long
 def test_the_command_takes_a_monitor_for_a_folder(place: Path, tmp_path: Path, capsys):
     given = ["run", "--gains", str(place / "gains"), "--data", str(place / "logs"), "--out", str(tmp_path / "o")]
     assert main([*given, "--monitor", "learned", "--normal", str(place / "normal")]) == 0

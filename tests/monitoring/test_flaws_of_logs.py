@@ -622,6 +622,7 @@ def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
     assert found.methods[0].faults[0].rms < 0.2
 
 
+@pytest.mark.long
 def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -> None:
     from obsynth.monitoring.thresholds.monitor import Sample
     from obsynth.numerics.square_root_estimation import ParameterState

@@ -203,6 +203,7 @@ def test_a_sensor_that_is_stuck_in_a_run_counts_as_not_measured_there_too(tmp_pa
     assert obsynth.load_thresholds(file).repeats.tolist() == [2.0, 2.0]
 
 
+@pytest.mark.long
 def test_a_sensor_that_stays_stuck_is_an_alarm_of_its_own() -> None:
     """Without its samples no other alarm may ever come."""
     design, data = heated(), log(2)

@@ -257,6 +257,7 @@ def test_a_monitor_is_not_used_up(wang):
     pd.testing.assert_frame_equal(first, second)
 
 
+@pytest.mark.long
 def test_a_continuous_design_on_a_log(machine):
     scenario = obsynth.Scenario(
         horizon=30, sample_time=0.02, noise=1, disturbances={"load": obsynth.Sine(amplitude=0.5, frequency=2.0)},

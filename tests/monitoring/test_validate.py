@@ -322,6 +322,7 @@ def test_outliers_that_a_gate_leaves_out_blame_no_variance(tank_design):
     assert found.ratios == {}
 
 
+@pytest.mark.long
 def test_no_run_is_made_twice(tank_design, monkeypatch):
     from obsynth.monitoring.calibration import validating, walk_shares
 

@@ -122,6 +122,7 @@ def jumps() -> tuple[DAEObserver, np.ndarray, np.ndarray]:
     return shipped, simulate_dae(model, u, dt=1e-3, R=[[1e-6]], seed=2).outputs, u
 
 
+@pytest.mark.long
 def test_a_hard_step_is_taken_by_itself_and_the_stretch_goes_on() -> None:
     shipped, y, u = jumps()
     running, alone = shipped.start(), 0

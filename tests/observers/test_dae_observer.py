@@ -256,6 +256,7 @@ def test_bounds_hold() -> None:
     assert found.parameters[:, 1].max() == 1e3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bounds", [{"rate": [-np.inf, 0.9]}, [[-np.inf, 0.9]]])
 def test_bounds_are_those_of_the_parameter_where_there_are_as_many_states(bounds) -> None:
     model = DAEModel(
@@ -396,6 +397,7 @@ def filled() -> DAEModel:
     )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "dt", "fewer"), [(levitated(), 0.002, False), (filled(), 1.0, True)])
 def test_a_plant_that_only_a_controller_keeps_at_its_nominal_point_has_a_design(
     model: DAEModel, dt: float, fewer: bool

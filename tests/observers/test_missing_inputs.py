@@ -123,6 +123,7 @@ def test_a_wrong_sample_beside_a_missing_input_is_left_out() -> None:
     assert (run.table["fhat[f]"].abs() / run.table["sd fhat[f]"])[60:].max() <= 4.5
 
 
+@pytest.mark.long
 def test_a_gap_goes_on_over_a_saved_state(tmp_path) -> None:
     u, y = measured()
     data, state = log_of(u, y), tmp_path / "state.json"

@@ -103,6 +103,7 @@ def test_the_benchmark_of_nonlinear_observers_runs(printed):
     assert all(len(row) == 3 for row in rows)
 
 
+@pytest.mark.long
 def test_the_unknown_input_observer_benchmark_runs(small_table):
     (row,) = small_table("ui_pi_observer")
     rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
@@ -128,6 +129,7 @@ def test_the_definiteness_benchmark_proves_every_row(small_table):
     assert sum("ball arithmetic" in row[1] for row in rows) == 1
 
 
+@pytest.mark.long
 def test_the_benchmark_of_designs_over_a_region_proves_every_row(small_table):
     rows = small_table("over_region")
     assert [row[:2] for row in rows] == [["2", "2"], ["2", "4"]]
@@ -147,6 +149,7 @@ def test_the_benchmarks_of_running_run(name, printed):
     assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
 
 
+@pytest.mark.long
 def test_the_benchmark_of_the_start_runs(small_table):
     rows = small_table("start")
     assert len(rows) == 6

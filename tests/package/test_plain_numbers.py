@@ -67,10 +67,12 @@ def test_what_is_said_of_a_plant_are_plain_numbers(plant: obsynth.DescriptorSyst
     assert found_in(**{name: ask(plant) for name, ask in asked.items()}) == []
 
 
+@pytest.mark.long
 def test_a_comparison_holds_plain_numbers() -> None:
     assert found_in(comparison=obsynth.compare(DISCRETE)) == []
 
 
+@pytest.mark.long
 def test_tolerances_and_runs_hold_plain_numbers() -> None:
     design = obsynth.fault_estimation_filter(drive())
     scenario = obsynth.Scenario(horizon=3.0, faults={"motor": obsynth.Step(size=1.0, start=1.0)}, noise=1.0)

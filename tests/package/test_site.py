@@ -15,6 +15,7 @@ from obsynth.cli.main import main
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+@pytest.mark.long
 def test_the_first_steps_lead_to_a_plotted_alarm(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.yaml").write_text((DOCS / "examples/thermal/spec.yaml").read_text(encoding="utf-8"))
@@ -63,6 +64,7 @@ def battery(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_stranger_with_a_thermal_plant_gets_to_an_alarm(battery, capsys):
     """Semicolons, decimal commas, dates and a column of another name; only commands that the page shows."""
     commands = re.findall(r"^obsynth .*$", (DOCS / "howto/thermal.md").read_text(encoding="utf-8"), re.MULTILINE)
@@ -111,6 +113,7 @@ def test_no_page_names_an_audit_that_no_reader_has():
     assert found == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("example", ["buck", "reactor"])
 def test_a_spec_of_a_how_to_is_designed_and_simulated(example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

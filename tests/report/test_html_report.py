@@ -281,6 +281,7 @@ class TestPictures:
             plot_gains(recursive)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_a_plant_that_is_not_regular_has_its_page_and_its_gains(dt: float, tmp_path: Path) -> None:
     # Two equations are missing; what is measured stands in for them.  The third state moves freely.
@@ -311,6 +312,7 @@ def test_the_page_says_what_holds_within_the_tolerances(tmp_path: Path) -> None:
     assert "every claim is for the exact model" in html_report(bare, tmp_path / "q.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_a_log_without_a_rule_for_alarms_is_not_said_to_be_free_of_them(continuous, tmp_path):
     log = pd.DataFrame({"time": np.arange(40) * 0.1, **{name: 0.0 for name in continuous.plant.output_names}})
     for name in continuous.plant.input_names:

@@ -309,6 +309,7 @@ def test_a_trade_off_is_sorted_and_says_what_is_missing(slow) -> None:
         plot_trade_off([], "decay", "gamma")
 
 
+@pytest.mark.long
 def test_legends_hide_nothing() -> None:
     """They stand above their panels."""
     estimates = made_estimates()

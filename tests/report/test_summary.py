@@ -210,6 +210,7 @@ def test_the_time_to_90_percent_is_the_observer_s_not_of_the_clock_of_a_slow_pla
     assert followed_steps(design)["f1"].most == pytest.approx(passed, rel=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("A", "fault", "unknown", "decay"),
     [
@@ -230,6 +231,7 @@ def test_the_largest_gain_is_that_of_its_peak(A, fault, unknown, decay):
     assert fault_gains(design).disturbance_gains.item() == pytest.approx(max(gains), rel=2e-5)
 
 
+@pytest.mark.long
 def test_a_summary_says_where_nothing_is_proved_of_constant_faults() -> None:
     """Linear methods prove it; of recursive ones, those over a region and faults that are never constant it is open."""
     told = ("unproved", "that the estimate of a constant fault equals it in the end")

@@ -194,6 +194,7 @@ def test_sensor_faults_change_what_is_measured_and_nothing_else(wang) -> None:
     np.testing.assert_allclose(bad.outputs[:, 2], good.outputs[:, 2] * np.where(late < 30, 0.75, 1.0), atol=1e-14)
 
 
+@pytest.mark.long
 def test_noise_has_the_sizes_that_are_stated_and_follows_the_seed() -> None:
     plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
     design = obsynth.fault_estimation_filter(plant, gamma=0.3)

@@ -50,6 +50,7 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     )
 
 
+@pytest.mark.long
 def test_the_command_line_says_which_sensor_finds_a_fault(capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["sensors", "--system", str(DRIVE.with_name("guaranteed_test.yaml")), "--set", "noise=0.0005", "--quiet"]
     assert main([*asked, "--goal", "threshold", "--below", "0.04", "--json"]) == 0

@@ -169,6 +169,7 @@ def test_malformed_cases_are_rows(spec):
     assert "nothing" in found.results[1].message
 
 
+@pytest.mark.long
 def test_large_gain_sets_have_a_binary_member(tmp_path):
     rng = np.random.default_rng(0)
     a = rng.normal(size=(90, 90)) / 12.0
