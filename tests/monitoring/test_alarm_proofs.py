@@ -54,10 +54,10 @@ def test_faults_are_proved_and_certificates_hold(design, found, tmp_path) -> Non
 
 
 @pytest.mark.parametrize("make", [wang, drive])
-def test_healthy_windows_are_never_proved_faulty(make, share) -> None:
+def test_healthy_windows_are_never_proved_faulty(make) -> None:
     design = obsynth.fault_estimation_filter(make())
     name, noise_bound = design.plant.disturbance_names[0], 1.0 if design.plant.nw else None
-    for seed in share(range(4), 4):
+    for seed in range(4):
         u, y = record(design, seed, fault=0.0)
         found = proved_alarm(
             design, u[:40], y[:40], window=12, disturbance_bounds={name: 0.1}, noise_bound=noise_bound,
@@ -65,6 +65,8 @@ def test_healthy_windows_are_never_proved_faulty(make, share) -> None:
         )  # fmt: skip
         assert not found.proved
         assert found.statement.startswith("Cannot be proved")
+        # Of the first of Wang's windows the simplex method goes in circles.
+        assert "no multipliers" not in found.statement
 
 
 @pytest.mark.parametrize("change", ["y", "margin", "below", "bounds", "statement", "window", "tolerance"])

@@ -31,8 +31,11 @@ ALARM_VERSION = 1
 
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"', suffix=".json")
 
-#: The solver of linear programmes may take so long; without an answer nothing is proved.
-SOLVER_SECONDS = 60.0
+#: Algorithms of HiGHS, and how long each may take: the simplex method alone may go in circles for ever.
+ALGORITHMS, SOLVER_SECONDS = ("highs-ipm", "highs"), 60.0
+
+#: Status of `scipy.optimize.linprog` where it has an answer.
+SOLVED_STATUS = 0
 
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
 MULTIPLIER_DIGITS = 12
@@ -273,16 +276,19 @@ def solved(programme: Programme) -> tuple[FloatArray, FloatArray] | None:
     cost = np.zeros(len(programme.lower))
     cost[-1] = 1.0
     equations = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
-    solution = linprog(
-        cost,
-        A_ub=below,
-        b_ub=programme.below.right,
-        bounds=np.stack([programme.lower, programme.upper], axis=1),
-        method="highs",
-        options={"time_limit": SOLVER_SECONDS},
-        **equations,
-    )
-    if solution.status != 0:
+    for algorithm in ALGORITHMS:
+        solution = linprog(
+            cost,
+            A_ub=below,
+            b_ub=programme.below.right,
+            bounds=np.stack([programme.lower, programme.upper], axis=1),
+            method=algorithm,
+            options={"time_limit": SOLVER_SECONDS},
+            **equations,
+        )
+        if solution.status == SOLVED_STATUS:
+            break
+    else:
         return None
     multipliers = (
         solution.eqlin.marginals if programme.equal.right else (),
