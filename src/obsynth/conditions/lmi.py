@@ -7,7 +7,7 @@ A solver may end in a panic that is no ``Exception``: whatever it does becomes a
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -118,11 +118,11 @@ def value_of(variable: Any) -> FloatArray:
     return np.asarray(value, dtype=np.float64)
 
 
-def semidefinite_problem(goal: Any, constraints: Sequence[Any]) -> Any:
-    """Return a `cvxpy.Problem` that is solved by Clarabel where no solver is named."""
+def semidefinite_problem(goal: Any, constraints: Sequence[Any], *, smaller: Callable[[], Any] | None = None) -> Any:
+    """Return a `cvxpy.Problem` that is solved by Clarabel where no solver is named, by way of a smaller one if any."""
     from obsynth.conditions.semidefinite_problem import SemidefiniteProblem
 
-    return SemidefiniteProblem(goal, list(constraints))
+    return SemidefiniteProblem(goal, list(constraints), smaller=smaller)
 
 
 def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:

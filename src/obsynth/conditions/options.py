@@ -22,6 +22,9 @@ SolverName: TypeAlias = Annotated[Any, WrittenAs("solver")]
 
 SolverOptions: TypeAlias = Annotated[Any, WrittenAs("solver options")]
 
+#: Values satisfy a constraint that they violate by no more than this share of their own size: solvers stop at 1e-8.
+VIOLATION_SHARE = 1e-6
+
 
 def own_terms(method: Any) -> tuple[str, ...]:
     """Return the names of the options that put something of one's own into the inequality."""

@@ -14,6 +14,7 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
 from obsynth.conditions.bisection import Answer, Bisection, bisected
+from obsynth.conditions.options import VIOLATION_SHARE
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.numerics.arguments import arguments_checked, real_number, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
@@ -25,9 +26,6 @@ from obsynth.verification.plant import condition_rows
 if TYPE_CHECKING:
     import cvxpy
 
-
-#: Values satisfy a constraint that they violate by no more than this share of their own size: solvers stop at 1e-8.
-VIOLATION_SHARE = 1e-6
 
 #: Numbers by name, such as the values of variables.
 Values = Mapping[str, FloatArray]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
+
+if TYPE_CHECKING:
+    from obsynth.conditions.semidefinite_problem import SmallerProblem
 
 #: What a design claims above the true norm of its filter, tried in turn until the proof goes through.
 CLAIMED_ABOVE_NORM = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -102,6 +105,10 @@ def wang2015(
 
     Notes
     -----
+    ``problem.solve()``, without a solver or settings, solves the inequality without Y (projection lemma), of half its
+    size, and takes the solution where it keeps (45) as well; there are no dual values then.  Problems of ``changed``,
+    or with a margin of your own, are solved as they are written.
+
     Below the least gamma an interior-point solver may stall rather than say infeasible; one of first order (SCS) says
     so, and so do the others with a bound, ``changed(constraints={"bound": cvxpy.trace(P) <= 1e4})``.
 
@@ -201,9 +208,18 @@ def wang2015(
 
     data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD}
     data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": unweighted}
+
+    def without_gain() -> SmallerProblem:
+        from obsynth.conditions.wang_without_gain import WrittenIn, wang_without_gain
+
+        level = None if gamma is None else gamma_squared
+        return wang_without_gain(convex, variables, level, WrittenIn(X, R0, unweighted, V))
+
+    # A margin of the user's is one of these coordinates, and without a filter there are no others.
+    smaller = without_gain if margin == MARGIN and all(condition.holds for condition in conditions) else None
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
-        lmi.semidefinite_problem(goal, list(constraints.values())),
+        lmi.semidefinite_problem(goal, list(constraints.values()), smaller=smaller),
         variables,
         {} if gamma is None else {"gamma_squared": gamma_squared},
         data,
