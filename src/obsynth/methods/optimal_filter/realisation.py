@@ -130,14 +130,17 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
     none = np.zeros((0, plant.nx)), np.zeros((0, 0))
     copies = _dying_modes(plant)
     lags = ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1)))
-    for share in IDENTITIES_LEFT:
-        for lag, (rows, moved) in lags:
-            if lag == 0 and rows is copies[0] and not len(rows):
-                continue
-            for filter_ in filters:
-                found = _followed(plant, filter_, rows, moved, lag, share)
-                if found is not None:
-                    return found
+    less_exact: Followed | None = None
+    for lag, (rows, moved) in lags:
+        if lag == 0 and rows is copies[0] and not len(rows):
+            continue
+        for filter_ in filters:
+            found, share = _followed(plant, filter_, rows, moved, lag)
+            if found is not None and share == IDENTITIES_LEFT[0]:
+                return found
+            less_exact = less_exact or found
+    if less_exact is not None:
+        return less_exact
     raise SolverError(
         "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
         "(sensor_noise), or give a longer delay."
@@ -191,9 +194,10 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 
 def _followed(
-    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int, share: float
-) -> Followed | None:
-    """Return a filter beside copies ``copied`` of modes, with T and T0; ``None`` where an equation misses a share."""
+    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int
+) -> tuple[Followed | None, float]:
+    """Return a filter beside copies ``copied`` of modes, with T and T0, and the share of `IDENTITIES_LEFT` to which
+    every equation holds; ``None`` where one misses all of them."""
     a, b, c, d = filter_
     e, own, _, seen = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
@@ -221,19 +225,14 @@ def _followed(
     products = ((-b, seen), (b, plant.Dd), (-d, seen), (d, plant.Dd))
     wanted = np.concatenate([(one @ other).ravel() for one, other in products])
     terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
-    found = _solved(system, wanted)
-    size, heights = float(np.max(np.abs(found), initial=0.0)), (nz * na, nz * plant.nd, rows * na)
-    exact = found
-    for cleaned in CLEANED_SHARES:
-        found = np.where(np.abs(exact) > cleaned * size, exact, 0.0)
-        if not _holds(system, found, (wanted, terms_wanted), heights, na, share):
-            return None
-        if not _shows_a_disturbance(system, found, (wanted, terms_wanted), heights, plant.nd):
-            break
+    heights = nz * na, nz * plant.nd, rows * na
+    solution, share = _cleaned_solution(system, (wanted, terms_wanted), heights, na, plant.nd)
+    if solution is None:
+        return None, share
     t, into, s, shown = (
         part.reshape(shape)
         for part, shape in zip(
-            np.split(found, np.cumsum(sizes)[:-1]),
+            np.split(solution, np.cumsum(sizes)[:-1]),
             ((nz, na), (nz, count), (rows, len(left)), (rows, count)),
             strict=True,
         )
@@ -242,7 +241,7 @@ def _followed(
     basis = reachable_basis(moved.T, np.vstack([into, shown]).T) if count else np.zeros((0, 0))
     into, shown, moved = into @ basis, shown @ basis, basis.T @ moved @ basis
     copies, kept = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
-    return Followed(
+    found = Followed(
         np.block([[a, into], [np.zeros((kept, nz)), moved]]),
         np.vstack([b, np.zeros((kept, plant.ny))]),
         np.hstack([c, shown]),
@@ -251,19 +250,40 @@ def _followed(
         s @ left,
         lag,
     )
+    return found, share
 
 
-def _solved(system: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return the least squares solution, each equation in its own unit, refined."""
+def _cleaned_solution(
+    system: FloatArray, wanted: tuple[FloatArray, FloatArray], heights: tuple[int, ...], width: int, disturbances: int
+) -> tuple[FloatArray | None, float]:
+    """Return the solution without entries that are rounding, and the share to which it holds; ``None`` for none."""
+    exact, units = _solved(system, wanted[0])
+    sizes = np.abs(exact) / units
+    for share in IDENTITIES_LEFT:
+        for cleaned in CLEANED_SHARES:
+            solution = np.where(sizes > cleaned * np.max(sizes, initial=0.0), exact, 0.0)
+            if not _holds(system, solution, wanted, heights, width, share):
+                break
+            if not _shows_a_disturbance(system, solution, wanted, heights, disturbances):
+                return solution, share
+        else:
+            return solution, share
+    return None, IDENTITIES_LEFT[-1]
+
+
+def _solved(system: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the least squares solution, each equation and each unknown in its own unit, refined, and the unknowns'."""
     sizes = np.maximum(np.max(np.abs(system), axis=1, initial=0.0), np.abs(wanted))
     scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
+    scaled = scale[:, None] * system
+    largest = np.max(np.abs(scaled), axis=0, initial=0.0)
+    units = 1.0 / np.where(largest > 0.0, largest, 1.0)
+    scaled *= units
     found = np.zeros(system.shape[1])
     for _ in range(SOLUTIONS):
         missed = scale * (wanted - system @ found)
-        found = (
-            found + scipy.linalg.lstsq(scale[:, None] * system, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
-        )
-    return found
+        found = found + units * scipy.linalg.lstsq(scaled, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
+    return found, units
 
 
 def _holds(
