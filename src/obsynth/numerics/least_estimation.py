@@ -225,7 +225,8 @@ def _size(problem: EstimationProblem) -> float:
 
     measured_size = size(problem.C) * size(problem.B) + size(problem.D)
     estimated_size = size(problem.L) * size(problem.B) + size(problem.D1)
-    return max(measured_size, WANTED_SHARE * estimated_size, SMALLEST)
+    # Where no noise enters at all, what is added is a share of what states of size one show.
+    return max(measured_size, WANTED_SHARE * estimated_size) or max(size(problem.C), SMALLEST)
 
 
 def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES) -> Whitened:
