@@ -13,6 +13,7 @@ import scipy.linalg
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.optimal_filter.delays import delays_of
+from obsynth.methods.optimal_filter.lasting_modes import with_lasting_modes_driven
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
@@ -137,10 +138,21 @@ def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]
         )
     claim = "a stable causal filter has this fault map, whatever known and decoupled inputs do"
     try:
-        first_problem(plant, asked)
+        first_problem_or_driven(plant, asked)
     except PreconditionError as error:
         return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error))
     return first, Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
+
+
+def first_problem_or_driven(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:
+    """Return `first_problem` of the plant, or where it has none of the one whose lasting modes are driven."""
+    try:
+        return first_problem(plant, asked)
+    except PreconditionError:
+        driven = with_lasting_modes_driven(plant)
+        if driven is plant:
+            raise
+        return first_problem(driven, asked)
 
 
 def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:

@@ -21,6 +21,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.error_system import LEAST_ROW, with_past
 
 #: The identities of T and T0 hold to this, of the numbers in them: to the second where no realisation keeps the first.
@@ -69,18 +70,20 @@ def minimal(filter_: Model, *, discrete: bool = False) -> Model:
     return _cleaned(a), _cleaned(b), _cleaned(c), _cleaned(d, passed)
 
 
-def realisations(filter_: Model, *, discrete: bool) -> list[Model]:
+def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list[Model]:
     """Return the minimal realisation, and one without the states that by their zeros are not reached or not read.
 
     Of a long window the first keeps no digits of coefficients that are as small as rounding; the second does.
+    ``outputs (ny,)``: units, powers of two, in which the outputs are near one: what is rounding is judged in them.
     """
-    filter_ = _without_rounding(filter_)
+    a, b, c, d = filter_
+    filter_ = _without_rounding((a, b / outputs, c, d / outputs))
     found = [minimal(filter_, discrete=discrete)]
     if discrete:
         a, b, c, d = filter_
         kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
         found.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
-    return found
+    return [(a, b * outputs, c, d * outputs) for a, b, c, d in found]
 
 
 def _without_rounding(filter_: Model) -> Model:
@@ -182,11 +185,14 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
         ratio = alpha / np.where(beta == 0.0, 1.0, beta)
         return np.asarray(finite & ((np.abs(ratio) < 1.0) if plant.is_discrete else (ratio.real < 0.0)))
 
-    a, e, alpha, beta, _, right = scipy.linalg.ordqz(plant.A.T, plant.E.T, sort=dies, output="real")
+    units = PlantUnits.of(plant).rounded()
+    left, states = units.equations[:, None], units.states
+    own_a, own_e = left * plant.A * states, left * plant.E * states
+    a, e, alpha, beta, _, right = scipy.linalg.ordqz(own_a.T, own_e.T, sort=dies, output="real")
     count = int(np.sum(dies(alpha, beta)))
     moved = np.linalg.solve(e[:count, :count], a[:count, :count]).T if count else np.zeros((0, 0))
-    rows = right[:, :count].T
-    driven = reachable_basis(moved, rows @ plant.Bd)
+    rows = right[:, :count].T * units.equations
+    driven = reachable_basis(moved, rows @ (plant.Bd * units.disturbances))
     if driven.shape[1]:
         free = scipy.linalg.null_space(driven.T)
         rows, moved = free.T @ rows, free.T @ moved @ free

@@ -15,6 +15,7 @@ from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
 from obsynth.methods.optimal_filter.delays import delays_of, in_words, is_auto, plain_delays
+from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import (
     Designed,
     FaultMap,
@@ -23,6 +24,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     first_problem,
     unit_of_gains,
 )
+from obsynth.methods.optimal_filter.lasting_modes import ADDED_DRIVES, with_lasting_modes_driven
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reference import plain
@@ -30,6 +32,7 @@ from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
+from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import uncayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -49,6 +52,10 @@ EXACT_SHARE = 0.3 * FAULT_MAP_SHARE
 CLOSED_GAP = 3e-5
 #: Noise of the sensors that is tried to bring them together, of the outputs' sizes; with more states it takes too long.
 OFFERED_NOISES, MOST_STATES_OF_OFFERS = (1e-4, 1e-3, 1e-2), 16
+LASTING_NOTE = (
+    "A mode of the plant lasts, and no noise drives it: no stable filter reaches the least gain. This one was found "
+    "with a little noise on that mode; its claims are for the plant without it."
+)
 #: Significant digits of a bound in words.
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
@@ -63,9 +70,36 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
     require_all_conditions(asked.existence(plant))
     plant = seen_plant(plant, asked.decoupled_names(plant))
     progress("searching the least gain")
-    curve, chosen = _chosen(plant, asked)
-    progress("building the realisation and its certificate")
-    return _made(plant, asked, curve, chosen)
+    try:
+        curve, chosen = _chosen(plant, asked)
+        progress("building the realisation and its certificate")
+        return _made(plant, asked, curve, chosen)
+    except (PreconditionError, SolverError):
+        if with_lasting_modes_driven(plant) is plant:
+            raise
+    if asked.norm == "h2":
+        raise SolverError(
+            "A mode of the plant lasts, and no noise drives it: of all stable filters none has the least mean square, "
+            "and the result is inconclusive. State noise that drives it (Bw), or take norm hinf."
+        )
+    progress("searching the least gain with noise on modes that last")
+    return _with_lasting_modes(plant, asked)
+
+
+def _with_lasting_modes(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
+    """Return the filter for the largest noise on modes that last of which less does not lower the gain."""
+    best, least_gain = None, math.inf
+    for drive in ADDED_DRIVES:
+        driven = with_lasting_modes_driven(plant, drive)
+        curve, chosen = _chosen(driven, asked)
+        made = _made(plant, asked, curve, chosen, searched=driven)
+        gain, least = made.certificate.claims["gain"], made.certificate.claims.get("least", 0.0)
+        if best is not None and gain >= least_gain * (1.0 - CLOSED_GAP):
+            return best
+        best, least_gain = made, gain
+        if chosen.is_nothing or gain - least <= CLOSED_GAP * gain:
+            break
+    return made
 
 
 def synthesis_of_gains(
@@ -82,10 +116,22 @@ def synthesis_of_gains(
     return _made(plant, asked, [], chosen)
 
 
-def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row], chosen: Designed) -> Synthesis:
-    """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled."""
+def _made(
+    plant: DescriptorSystem,
+    asked: OptimalFilterMethod,
+    curve: list[_Row],
+    chosen: Designed,
+    *,
+    searched: DescriptorSystem | None = None,
+) -> Synthesis:
+    """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled.
+
+    ``searched``: the plant that the filter was searched for, where noise was added.
+    """
     fault_map = chosen.fault_map
-    chosen, found, observer = _with_enough_noise(plant, chosen, asked.norm)
+    chosen, found, observer = _with_enough_noise(plant if searched is None else searched, chosen, asked.norm)
+    if searched is not None:
+        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, observer, found))
     matrices, claims = certified(plant, chosen, observer, found, asked.norm)
     matrices |= {"T": found.T, "T0": found.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
@@ -107,7 +153,21 @@ def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row]
     }
     gains = {"T": found.T, "T0": found.T0}
     notes = tuple(_notes(plant, curve, chosen, asked, claims))
+    notes += () if searched is None else (LASTING_NOTE,)
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
+
+
+def _recomputed_gain(plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: Followed) -> float:
+    """Return the gain of a filter on another plant than it was searched for."""
+    model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
+    fault_map = chosen.fault_map
+    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
+    a, b, c, d = channel.middle
+    if not plant.is_discrete:
+        alpha = chosen.problem.alpha
+        inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
+        a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+    return float(hinf_norm(a, b, c, d).upper)
 
 
 def _with_enough_noise(
@@ -121,7 +181,8 @@ def _with_enough_noise(
     while True:
         problem, fault_map = chosen.problem, chosen.fault_map
         try:
-            ways = realisations(chosen.filter, discrete=plant.is_discrete)
+            outputs = PlantUnits.of(plant).rounded().outputs
+            ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
             found = followed(plant, ways, problem.window + problem.shift)
             rows = len(found.C)
             names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))

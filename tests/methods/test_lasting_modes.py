@@ -1,0 +1,90 @@
+"""Optimal filters of plants with modes that last and that no noise drives: constants, oscillations, no noise at all."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import obsynth
+
+TURN = [[math.cos(1.0), math.sin(1.0)], [-math.sin(1.0), math.cos(1.0)]]
+SENSORS = {"Bf": [[0], [1]], "Bw": np.zeros((2, 3)), "Dw": np.eye(3)}
+PLANTS = {
+    "a constant": {"A": [[1, 0], [0, 0.5]], "C": [[1, 0], [1, 1], [0, 1]], **SENSORS, "dt": 1.0},
+    "a constant beside a noisy state": {
+        "A": [[1, 0], [0, 0.5]],
+        "C": [[1, 0], [1, 1], [0, 1]],
+        "Bf": [[0], [1]],
+        "Bw": [[0, 0, 0, 0], [0, 0, 0, 1]],
+        "Dw": np.eye(3, 4),
+        "dt": 1.0,
+    },
+    "an oscillation": {
+        "A": [[*TURN[0], 0], [*TURN[1], 0], [0, 0, 0.5]],
+        "C": [[1, 0, 0], [1, 0, 1], [0, 0, 1]],
+        "Bf": [[0], [0], [1]],
+        "Bw": np.zeros((3, 3)),
+        "Dw": np.eye(3),
+        "dt": 1.0,
+    },
+    "a constant, continuous": {"A": [[0, 0], [0, -0.5]], "C": [[1, 0], [1, 1], [0, 1]], **SENSORS},
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
+    plant = obsynth.DescriptorSystem(**PLANTS[name])
+    design = obsynth.optimal_filter(plant)
+    assert design.report.passed
+    assert "lasts, and no noise drives it" in design.notes[-1]
+    poles = np.linalg.eigvals(design.observer.Az)
+    assert np.max(np.abs(poles)) < 1.0 if plant.is_discrete else np.max(poles.real) < 0.0
+
+
+@pytest.mark.parametrize("name", ["a constant", "a constant beside a noisy state", "an oscillation"])
+def test_its_gain_is_the_limit_of_plants_whose_mode_is_driven_less_and_less(name: str) -> None:
+    plant = obsynth.DescriptorSystem(**PLANTS[name])
+    design = obsynth.optimal_filter(plant)
+    lasting = plant.nx - 1
+    driven = plant.replace(
+        Bw=np.hstack([plant.Bw, 1e-4 * np.eye(plant.nx)[:, :lasting]]),
+        Dw=np.hstack([plant.Dw, np.zeros((plant.ny, lasting))]),
+        noise_names=[*plant.noise_names, *(f"drive {i}" for i in range(lasting))],
+    )
+    limit = obsynth.optimal_filter(driven, delay=int(design.delay))
+    assert design.least <= limit.gain * (1.0 + 1e-9)
+    assert design.gain == pytest.approx(limit.gain, rel=1e-6)
+
+
+def test_a_run_from_an_offset_forgets_it() -> None:
+    plant = obsynth.DescriptorSystem(**PLANTS["a constant"])
+    design = obsynth.optimal_filter(plant)
+    y = np.tile(plant.C @ [1.0, 0.0], (2000, 1))
+    faults = design.observer.run(y).faults
+    assert np.max(np.abs(faults[:5])) > 1e-2
+    assert np.max(np.abs(faults[-5:])) < 1e-8
+
+
+def test_the_least_mean_square_is_inconclusive_and_says_what_helps() -> None:
+    plant = obsynth.DescriptorSystem(**PLANTS["a constant"])
+    with pytest.raises(obsynth.SolverError, match="State noise that drives it"):
+        obsynth.optimal_filter(plant, norm="h2")
+
+
+def test_a_plant_over_many_decades_without_noise_has_a_filter_that_follows_it() -> None:
+    """Without noise there was no size for what is added, and coordinates over twelve decades lost small entries."""
+    rng = np.random.default_rng(46)
+    for _ in range(6):
+        a, c = rng.standard_normal((4, 4)), rng.standard_normal((2, 4))
+        states, outputs = 10.0 ** rng.uniform(-6.0, 6.0, 4), 10.0 ** rng.uniform(-6.0, 6.0, 2)
+        plant = obsynth.DescriptorSystem(
+            A=states[:, None] * a * (0.9 / np.max(np.abs(np.linalg.eigvals(a)))) / states,
+            C=outputs[:, None] * c / states,
+            Bf=states[:, None] * rng.standard_normal((4, 1)),
+            dt=1.0,
+        )
+        design = obsynth.optimal_filter(plant)
+        assert design.report.passed
+        assert design.delay == 1
