@@ -75,3 +75,11 @@ def test_unknown_inputs_are_decoupled_in_any_unit() -> None:
     design = obsynth.descriptor_kalman(plant, Q=1e-8, R=1e-8)
     missed = np.abs(design.certificate.matrices["tracking"] @ plant.vertices[0].Bd).max(axis=0)
     assert np.all(missed <= 1e-12 * np.abs(plant.vertices[0].Bd).max(axis=0))
+
+
+@pytest.mark.parametrize("method", ["ui-pi-observer", "functional-filter"])
+@pytest.mark.parametrize("model", ["ramp", {"f1": "ramp"}, {"sinusoid": 3.0}, {"exponential": -1e-6}])
+def test_an_observer_for_steps_is_named_as_one(method: str, model: object) -> None:
+    design = DESIGNS[method]()
+    named = replace(design, options={**design.options, "fault_model": model}, report=None)
+    assert "model of faults" in {row.name for row in obsynth.verify(named).failures}

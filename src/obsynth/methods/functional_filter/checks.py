@@ -20,6 +20,7 @@ from obsynth.results.checks import Check, fitting_check, information, upper_boun
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import listed_gains
 from obsynth.verification.error_system import ErrorModel, natural_scaling
+from obsynth.verification.fault_models import fault_model_row
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.inequalities import decay_row, stability_row
 from obsynth.verification.plant import condition_rows, plant_information
@@ -136,6 +137,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         state_conditions(plant, chosen_states(options.get("states"), plant), options.get("decay"))
     )
     if observer.fault_names or options.get("residuals") is not None:
+        yield fault_model_row(design)
         yield from condition_rows(
             conditions(
                 plant,

@@ -19,6 +19,7 @@ from obsynth.methods.ui_pi_observer.number_checks import gain_rows, noise_rows, 
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.fault_models import fault_model_row
 from obsynth.verification.identities import ALIKE, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -54,6 +55,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     if not fitting:
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _UI_PI_MATRICES)
+    yield fault_model_row(design)
     model = shipped_model(certificate.matrices, plant.nf)
     *conditions, last = existence_conditions(plant, model)
     yield from condition_rows(conditions)

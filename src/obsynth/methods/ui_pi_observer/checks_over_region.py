@@ -18,6 +18,7 @@ from obsynth.proofs.vertex_inequalities import Vertex, pairs_of
 from obsynth.results.checks import Check, fitting_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
+from obsynth.verification.fault_models import fault_model_row
 from obsynth.verification.identities import EQUALITY_TOLERANCE, Residual, equality, worst
 from obsynth.verification.over_region import (
     GAIN_WITNESSES,
@@ -49,6 +50,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
     if not fits:
         return
+    yield fault_model_row(design)
     model = shipped_model(matrices, plant.nf)
     yield from condition_rows(pi_conditions_over_region(plant, model))
     same = same_scheduling_row(plant, observer)
