@@ -113,6 +113,12 @@ TABLE = {
     ),
     "states beside no estimate": ("both", lambda d: d.replace(options={**d.options, "faults": ["a"]}), [FITS]),
     "a delay that is not shipped": ("both", lambda d: d.replace(options={**d.options, "delay": 2}), [FITS]),
+    "a model of faults that is not shipped": (
+        "both", lambda d: d.replace(options={**d.options, "fault_model": "ramp"}), ["model of faults"],
+    ),
+    "a walk that is not shipped": (
+        "both", lambda d: d.replace(options={**d.options, "fault_rate": 0.06}), ["walks of faults"],
+    ),
     "known input": ("both", observer(Bu=at(0, 0)), [U_ERROR]),
     "known input at once": ("both", observer(Du=at(0, 0)), [U_ROW]),
     "input of the plant": ("both", of_plant(B=at(0, 0)), [U_ERROR]),

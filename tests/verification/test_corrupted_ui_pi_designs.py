@@ -33,7 +33,7 @@ FITS, SYLVESTER, INPUTS = "fits the plant", "Sylvester", "inputs"
 IN_ERROR, IN_ESTIMATES = "disturbance in the error", "disturbance in the estimates"
 STATE, FAULT, RESIDUAL, FEEDTHROUGH = "state", "fault", "residual", "feedthrough"
 STABILITY, POLES, DECAY, DIGITS = "stability", "poles", "decay", "stable with 9 digits"
-DECOUPLING, NOISE = "decoupling", "noise amplification"
+DECOUPLING, NOISE, MODEL = "decoupling", "noise amplification", "model of faults"
 D3_STEP, D3_ONE, D3_HALF = (f"exists: (D3) fault model at {value}" for value in ("0", "1", "0.5"))
 D3_SINE, ORDER = "exists: (D3) fault model at 0.939373 +- 0.342898j", "exists: order of the fault model"
 ENOUGH, D1, D2 = "exists: nd <= ny", "exists: (D1) decoupling", "exists: (D2) zeros"
@@ -261,9 +261,9 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "poles without a row": ("fixed", cut("poles"), (FITS,)),
     "no tracking": ("paper", without("tracking"), (FITS,)),
     "no fault model": ("paper", without("Phi"), (FITS,)),
-    "Phi of another fault": ("fixed", certificate("Phi", 0, 0, -0.5), (SYLVESTER,)),
-    "Phi of a growing fault at the zero": ("paper", certificate("Phi", 0, 0, 0.5), (SYLVESTER, D3_HALF)),
-    "Cw": ("paper", certificate("Cw", 0, 0, 1.1), (SYLVESTER, FAULT)),
+    "Phi of another fault": ("fixed", certificate("Phi", 0, 0, -0.5), (SYLVESTER, MODEL)),
+    "Phi of a growing fault at the zero": ("paper", certificate("Phi", 0, 0, 0.5), (SYLVESTER, D3_HALF, MODEL)),
+    "Cw": ("paper", certificate("Cw", 0, 0, 1.1), (SYLVESTER, FAULT, MODEL)),
     "decay claimed too large": ("paper", claim_times("decay", 1.01), (DECAY,)),
     "decay NaN": ("direct", claim_times("decay", np.nan), (DECAY,)),
     "noise claimed too small": ("paper", claim_times("noise_amplification", 0.99), (NOISE,)),

@@ -83,3 +83,13 @@ def test_an_observer_for_steps_is_named_as_one(method: str, model: object) -> No
     design = DESIGNS[method]()
     named = replace(design, options={**design.options, "fault_model": model}, report=None)
     assert "model of faults" in {row.name for row in obsynth.verify(named).failures}
+
+
+def test_walks_are_those_of_the_options() -> None:
+    """A smaller walk than the one that was designed for has a smaller deviation."""
+    design = DESIGNS["functional-filter"]()
+    matrices = design.certificate.matrices
+    deviations = np.column_stack([matrices["deviations"][:, 0], 1.01 * matrices["deviations"][:, 0]])
+    smaller = {**matrices, "walks": 0.01 * matrices["walks"], "deviations": deviations}
+    report = obsynth.verify(replace(design, certificate=replace(design.certificate, matrices=smaller), report=None))
+    assert {row.name for row in report.failures} == {"walks of faults"}

@@ -9,6 +9,8 @@ import numpy as np
 from obsynth.analysis.existence.augmented_pencils import shipped_model
 from obsynth.analysis.existence.functional_filter import conditions, residual_sets
 from obsynth.analysis.existence.functional_states import chosen_states, state_conditions
+from obsynth.errors import SpecError
+from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.methods.ui_pi_observer.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray, reachable
@@ -16,7 +18,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import noise_words
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import listed_gains
 from obsynth.verification.error_system import ErrorModel, natural_scaling
@@ -39,6 +41,8 @@ DEVIATION_TOLERANCE = 1e-4
 _FUNCTIONAL_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
 
 _SOURCE = "identities of the error z - T E x, ours"
+
+_WALKS, _WALKS_CLAIM = "walks of faults", "the random walks of the deviations are those of the options"
 
 
 def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
@@ -124,6 +128,28 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             )
 
 
+def _walk_row(design: ObserverDesign) -> Check:
+    """Return the row on the walks of the fault models: those that the options state, or say that they found."""
+    (plant, _), matrices, options = design.linear, design.certificate.matrices, design.options
+    walks, wrong = np.diag(matrices["walks"]), list[str]()
+    if np.any(matrices["walks"] != np.diag(walks)):
+        wrong.append("one walk moves several states")
+    rates = {name: options.get(f"fault_rate{name}") for name in ("", "_found")}
+    of_faults = matrices["Cw"] != 0.0
+    if rates[""] is not None:
+        try:
+            stated = FunctionalFilter(fault_rate=rates[""]).rates(plant)
+        except (SpecError, TypeError, ValueError) as error:
+            return nothing_wrong(_WALKS, _WALKS_CLAIM, [str(error)], source="options")
+        for name in design.linear[1].fault_names:
+            row = plant.fault_names.index(name)
+            if stated is not None and np.any(walks[of_faults[row]] != stated[row]):
+                wrong.append(f"the walk of {name}")
+    elif sorted(walks[walks != 0.0]) != sorted(rate for rate in rates["_found"] or () if rate != 0.0):
+        wrong.append("fault_rate_found")
+    return nothing_wrong(_WALKS, _WALKS_CLAIM, wrong, source="options")
+
+
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.methods.verifying.verify`."""
     (plant, observer), matrices = design.linear, design.certificate.matrices
@@ -150,6 +176,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
         yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
     yield listed_gains(design, {name: matrices[name] for name in ("T", "T0")})
+    yield _walk_row(design)
     yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
     claims = design.certificate.claims
     order = claims.get("order", float("nan"))
