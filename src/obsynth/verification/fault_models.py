@@ -6,7 +6,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.checks import Check, upper_bound_check
 from obsynth.results.design import ObserverDesign
@@ -16,9 +18,9 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 ENTRY_ROUNDINGS = 32.0
 
 
-def fault_model_row(design: ObserverDesign) -> Check:
+def fault_model_row(plant: DescriptorSystem | PolytopicSystem, design: ObserverDesign) -> Check:
     """Return the row on Phi and Cw: they are those of the option ``fault_model``, steps where it is left out."""
-    plant, matrices, options = design.plant, design.certificate.matrices, design.options
+    matrices, options = design.certificate.matrices, design.options
     difference, detail = np.inf, ""
     try:
         named = options.get("fault_model")

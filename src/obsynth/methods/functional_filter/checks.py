@@ -163,7 +163,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         state_conditions(plant, chosen_states(options.get("states"), plant), options.get("decay"))
     )
     if observer.fault_names or options.get("residuals") is not None:
-        yield fault_model_row(design)
+        yield fault_model_row(plant, design)
         yield from condition_rows(
             conditions(
                 plant,

@@ -55,7 +55,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     if not fitting:
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _UI_PI_MATRICES)
-    yield fault_model_row(design)
+    yield fault_model_row(plant, design)
     model = shipped_model(certificate.matrices, plant.nf)
     *conditions, last = existence_conditions(plant, model)
     yield from condition_rows(conditions)

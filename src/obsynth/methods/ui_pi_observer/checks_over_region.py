@@ -50,7 +50,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
     if not fits:
         return
-    yield fault_model_row(design)
+    yield fault_model_row(plant, design)
     model = shipped_model(matrices, plant.nf)
     yield from condition_rows(pi_conditions_over_region(plant, model))
     same = same_scheduling_row(plant, observer)
