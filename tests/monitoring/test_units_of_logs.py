@@ -30,10 +30,10 @@ def vessel():
     )  # fmt: skip
 
 
-def log(start=(5.0, 40.0)) -> pd.DataFrame:
+def log(start=(5.0, 40.0), length=ROWS) -> pd.DataFrame:
     """Return rows of the vessel, by small steps of Euler."""
     rng, x, rows = np.random.default_rng(3), np.array(start), []
-    for k in range(ROWS):
+    for k in range(length):
         speed, valve = 1.0 + 0.2 * np.sign(np.sin(0.3 * k)), 1.0
         for _ in range(20 if k else 0):
             x = x + 0.05 * np.array([(speed - 0.2 * valve * x[0]) / 20.0, (20.0 + 4.0 * speed * x[0] - x[1]) / 40.0])
@@ -112,6 +112,35 @@ def test_a_linear_design_is_asked_for_its_operating_point():
     # What moves from 0 to its operating point is a start.
     data["wall"] = np.linspace(0.0, 20.0, 30)
     assert obsynth.run_on_data(design, data).rows == 30
+
+
+def test_levels_are_not_learned_from_a_log_in_another_unit(vessel):
+    normal, kelvin = log(), log()
+    kelvin["temp"] += 273.15
+    # Every log is looked at, not only the first.
+    for data in (kelvin, [normal, kelvin]):
+        with pytest.raises(SpecError, match=r"adding -273.15 \(kelvin for degrees Celsius\)") as refused:
+            obsynth.learn_thresholds(vessel, data)
+        assert refused.value.path == "columns.temp"
+    # A monitor takes no option of logs: it says whose result it takes.
+    with pytest.raises(SpecError, match=r"adding -273.15.*obsynth.learn_thresholds"):
+        obsynth.online_monitor(vessel, "learned", normal=kelvin)
+
+
+@pytest.mark.long
+def test_levels_are_learned_after_either_remedy(vessel, tmp_path: Path, capsys):
+    vessel.save(tmp_path / "g.json")
+    data = log(length=400)
+    expected = obsynth.learn_thresholds(vessel, data).levels
+    data["press"] *= 1e5
+    data.to_csv(tmp_path / "log.csv", index=False)
+    scaled = obsynth.learn_thresholds(vessel, data, scales={"press": 1e-5}).levels
+    np.testing.assert_allclose(scaled, expected, rtol=1e-6)
+    given = ["thresholds", "--gains", str(tmp_path / "g.json"), "--data", str(tmp_path / "log.csv")]
+    assert main(given) == 2
+    assert "--scale press=1e-05" in capsys.readouterr().err
+    assert main([*given, "--units-as-is"]) == 0
+    assert main([*given, "--scale", "press=1e-05"]) == 0
 
 
 @pytest.mark.long

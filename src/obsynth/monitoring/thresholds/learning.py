@@ -20,6 +20,7 @@ from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, Logs, chunks
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.monitoring.logs.stuck_sensors import Unrepeated, longest_repeats, rising, stuck_rows
+from obsynth.monitoring.logs.unit_check import UnitCheck
 from obsynth.monitoring.thresholds.alarm_rates import rows_per_alarm
 from obsynth.monitoring.thresholds.learned import NO_PAIRS, LearnedThresholds, WrongPairs
 from obsynth.monitoring.thresholds.learned_from_rows import (
@@ -73,6 +74,7 @@ def learn_thresholds(
     gap: float | None = None,
     warm_up: float | None = None,
     seed: Seed = 0,
+    units_as_is: bool = False,
 ) -> LearnedThresholds:
     """Learn the thresholds of a design from rows of its plant without faults.
 
@@ -99,6 +101,9 @@ def learn_thresholds(
         As for `obsynth.run_on_data`.
     seed : int, optional
         Of the bootstrap.
+    units_as_is : bool, optional
+        As for `obsynth.run_on_data`: by default a log in which one signal is likely in another unit than the plant's is
+        refused, as its levels would be those of the wrong unit.
 
     Returns
     -------
@@ -110,7 +115,8 @@ def learn_thresholds(
     Raises
     ------
     SpecError
-        The log cannot be read, holds too few rows, or nothing moves in it; the rate is none.
+        The log cannot be read, holds too few rows, or nothing moves in it; the rate is none; a signal is likely in
+        another unit than the plant's.
 
     References
     ----------
@@ -152,6 +158,11 @@ def learn_thresholds(
 
     first_run = started()
     read = [_read(log_part, first_run.signals, time_zone, time_unit) for log_part in several(data)]
+    if not units_as_is:
+        for log_part, _ in read:
+            units = UnitCheck(design, first_run.signals)
+            units.take(first_run.signals.deviations(log_part))
+            units.finish()
     log, borders = (
         np.vstack([log_part for log_part, _ in read]),
         np.cumsum([0, *(len(log_part) for log_part, _ in read)]),

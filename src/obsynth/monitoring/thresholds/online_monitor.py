@@ -237,7 +237,16 @@ def _learned(design: ObserverDesign, normal: Any, *, sensor_faults: bool) -> Mon
     if isinstance(normal, (str, Path)) and Path(normal).suffix.lower() == ".json":
         normal = load_thresholds(normal)
     if not isinstance(normal, LearnedThresholds):
-        normal = learn_thresholds(design, normal)
+        try:
+            normal = learn_thresholds(design, normal)
+        except SpecError as error:
+            if not (error.path or "").startswith("columns."):
+                raise
+            raise SpecError(
+                f"{error} A monitor takes no such option for its rows without faults: learn from them first "
+                "(obsynth thresholds, obsynth.learn_thresholds), and give the result (normal, --normal).",
+                path=error.path,
+            ) from error
     return learned_monitor(design, normal, sensor_faults=sensor_faults)
 
 

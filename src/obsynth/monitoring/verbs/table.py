@@ -242,6 +242,7 @@ VERBS = {
                         "seconds that are left out as warm-up, at the start and after gaps",
                         type=float,
                     ),
+                    flag("--units-as-is", "go on where a signal is likely in another unit than the plant's"),
                 )
             ),
             JSON,

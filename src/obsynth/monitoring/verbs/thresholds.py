@@ -42,6 +42,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         scales=numbers_of(options.scale),
         gap=options.gap,
         warm_up=options.warm_up,
+        units_as_is=options.units_as_is,
     )
     file = None if target is None else learned.save(target)
     levels = dict(zip(learned.statistics.names, learned.levels.tolist(), strict=True))
