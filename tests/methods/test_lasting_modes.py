@@ -1,4 +1,4 @@
-"""Optimal filters of plants with modes that last and that no noise drives: constants, oscillations, no noise at all."""
+"""Optimal filters at the boundary of stability: modes that last and no noise drives, zeros on the axis or circle."""
 
 from __future__ import annotations
 
@@ -88,3 +88,22 @@ def test_a_plant_over_many_decades_without_noise_has_a_filter_that_follows_it() 
         design = obsynth.optimal_filter(plant)
         assert design.report.passed
         assert design.delay == 1
+
+
+#: What the outputs show of the fault: its first or second derivative alone, the sum of two samples.
+ZEROS_ON_THE_BOUNDARY = {
+    "derivative": {"E": [[0, 1], [0, 0]], "C": [[1, 0]], "dt": 0.0},
+    "second derivative": {"E": [[0, 1, 0], [0, 0, 1], [0, 0, 0]], "C": [[1, 0, 0]], "dt": 0.0},
+    "sum of two samples": {"E": [[0, 1], [0, 0]], "C": [[1, 1]], "dt": 1.0},
+}
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+@pytest.mark.parametrize("name", ZEROS_ON_THE_BOUNDARY)
+def test_a_zero_on_the_boundary_leaves_no_stable_filter(name: str, norm: str) -> None:
+    n = len(ZEROS_ON_THE_BOUNDARY[name]["E"])
+    plant = obsynth.DescriptorSystem(
+        **ZEROS_ON_THE_BOUNDARY[name], A=np.eye(n), Bf=np.eye(n)[:, -1:], Bw=np.zeros((n, 1)), Dw=[[1.0]]
+    )
+    with pytest.raises(obsynth.PreconditionError, match="a zero that is not strictly stable"):
+        obsynth.optimal_filter(plant, norm=norm)

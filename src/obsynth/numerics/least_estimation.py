@@ -174,7 +174,7 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
         )
     if not rows:
         # Nothing is left to be weighed: there is one filter.
-        if np.any(np.linalg.eigvals(a).real >= 0.0):
+        if np.any(np.linalg.eigvals(a).real >= -0.5 * (1.0 - STABLE_RADIUS) * problem.alpha):
             raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
         covariance = np.zeros_like(a)
     else:
@@ -235,7 +235,7 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
     Where an output has no noise, some is added: the filter is then one for the plant as given, and so is its gain.
     """
     n, rows, size = len(problem.A), len(problem.C), _size(problem)
-    stable = bool(np.max(np.abs(np.linalg.eigvals(problem.A)), initial=0.0) < 1.0)
+    stable = bool(np.max(np.abs(np.linalg.eigvals(problem.A)), initial=0.0) < STABLE_RADIUS)
     blind = (
         not problem.B.shape[1]
         or np.max(np.abs(_responses(problem, np.array([0.7, 2.1]))[1]), initial=0.0) < BLIND_SHARE * size
