@@ -93,3 +93,28 @@ def test_walks_are_those_of_the_options() -> None:
     smaller = {**matrices, "walks": 0.01 * matrices["walks"], "deviations": deviations}
     report = obsynth.verify(replace(design, certificate=replace(design.certificate, matrices=smaller), report=None))
     assert {row.name for row in report.failures} == {"walks of faults"}
+
+
+def test_a_large_fault_does_not_show_in_the_estimate_of_a_small_one() -> None:
+    """A share of 1e-7 of a fault of a million is a tenth of a fault of one, beside which it is judged."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5, 0.1], [0.0, 0.4]],
+        C=[[1, 0], [0, 1], [1, 1]],
+        Bf=[[1e-6, 0], [0, 1]],
+        Bw=np.zeros((2, 3)),
+        Dw=0.1 * np.eye(3),
+        dt=1.0,
+    )
+    design = obsynth.optimal_filter(plant, delay=1)
+    mixed = np.array([[1.0, 0.0], [1e-7, 1.0]])
+    rows = {name: mixed @ getattr(design.observer, name) for name in ("Cz", "Du", "Dy")}
+    matrices = {**design.certificate.matrices, "T0": mixed @ design.certificate.matrices["T0"]}
+    changed = replace(
+        design,
+        observer=replace(design.observer, **rows),
+        certificate=replace(design.certificate, matrices=matrices),
+        gains={},
+        report=None,
+    )
+    assert obsynth.verify(design).passed
+    assert "fault map" in {row.name for row in obsynth.verify(changed).failures}

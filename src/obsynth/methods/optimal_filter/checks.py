@@ -16,6 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import unproved
@@ -227,9 +228,10 @@ def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
 
 
 def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int]:
-    """Return by which share of its largest entry the transfer from the faults misses the fault map, and the points.
+    """Return by which share of what it shall be the transfer from the faults misses the fault map, and the points.
 
-    These are more than the difference has states.
+    Each estimate is judged beside the largest entry of its own row, each fault in a unit that suits the plant.  The
+    points are more than the difference has states.
     """
     plant, observer, reference, delay = model.plant, model.observer, fault_map.reference, fault_map.delay or 0
     late = np.array(fault_map.delays or (0,) * plant.nf)
@@ -241,14 +243,16 @@ def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int
     else:
         size = max(float(np.max(np.abs(np.linalg.eigvals(observer.Az)), initial=0.0)), 1.0) if observer.order else 1.0
         points = 1j * size * np.tan((np.arange(count) + 0.5) * np.pi / (2 * count))
-    worst, largest = 0.0, 0.0
+    units = PlantUnits.of(plant).faults
+    worst, largest = np.zeros(len(c)), np.zeros(len(c))
     for point in points:
         found = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
         wanted = np.diag(point**-late) if reference is None else _response(reference, point)
         # What is no number stays none, and fails.
-        worst = float(np.maximum(worst, np.max(np.abs(found - wanted), initial=0.0)))
-        largest = max(largest, float(np.max(np.abs(wanted), initial=0.0)))
-    return (worst / largest if largest > 0.0 else worst), count
+        worst = np.maximum(worst, np.max(np.abs(found - wanted) * units, axis=1, initial=0.0))
+        largest = np.maximum(largest, np.max(np.abs(wanted) * units, axis=1, initial=0.0))
+    sizes = np.where(largest > 0.0, largest, np.max(largest, initial=0.0) or 1.0)
+    return float(np.max(worst / sizes, initial=0.0)), count
 
 
 def _response(system: Model, point: complex) -> Any:
