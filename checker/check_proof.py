@@ -23,6 +23,10 @@ from fractions import Fraction
 FORMAT, VERSION = "obsynth-proof", 1
 #: Files with larger exponents are refused: a few bytes could otherwise fill the memory.
 LARGEST_EXPONENT = 100_000
+#: So are larger sizes and counts, for the same reason, and more states than this with those of the lag.
+LARGEST_COUNT, MOST_STATES = 100_000, 5_000
+#: Kinds of rows.
+ROW_KINDS = ("state", "fault", "residual")
 #: The identities of an observer must hold to this share of the terms that they consist of.
 LARGEST_SHARE = Fraction(1, 1000)
 NOT_ITS_FAULT = "an estimate is not that of its fault"
@@ -195,11 +199,16 @@ class System:
         require(self.dt >= 0, "the sample time is negative")
         self.discrete = self.dt > 0
         self.shapes()
-        self.names = {kind: list(map(str, plant["names"][kind])) for kind in ("states", "faults", "disturbances")}
-        self.row_kinds = [(str(kind), str(name), int(delay)) for kind, name, delay in observer["rows"]]
+        counts = {"states": self.E.columns, "faults": self.Bf.columns, "disturbances": self.Bd.columns}
+        self.names = {kind: read_names(plant["names"][kind], count, kind) for kind, count in counts.items()}
+        self.row_kinds = [
+            (kind, name, read_count(delay, "a delay", most=10_000)) for kind, name, delay in observer["rows"]
+        ]
         require(len(self.row_kinds) == self.Cz.rows, "each row of the observer needs a kind, a name and a delay")
-        self.lag, self.decoupled = int(follows["lag"]), bool(follows["decoupled"])
-        require(0 <= self.lag <= 1000 and (self.discrete or not self.lag), "the lag is no number of samples")
+        self.lag, self.decoupled = read_count(follows["lag"], "the lag", most=1000), follows["decoupled"]
+        require(isinstance(self.decoupled, bool), "whether disturbances are decoupled is true or false")
+        require(self.discrete or not self.lag, "a lag needs samples")
+        require((self.lag + 1) * self.E.rows <= MOST_STATES, "the lag is too long")
         self.Phi, self.Cw = read_matrix(follows["Phi"]), read_matrix(follows["Cw"])
         self.T, self.T0 = read_matrix(follows["T"]), read_matrix(follows["T0"])
         self.witness, self.proved_contraction = file.get("contraction"), None
@@ -246,7 +255,7 @@ class System:
         require((self.T0.rows, self.T0.columns) == (self.Cz.rows, total), "T0 does not fit")
         goal = zero(self.Cz.rows, total)
         for i, (kind, name, delay) in enumerate(self.row_kinds):
-            require(kind in ("state", "fault", "residual"), f"row {i + 1} is of an unknown kind")
+            require(kind in ROW_KINDS and isinstance(name, str), f"row {i + 1} is of an unknown kind")
             if kind == "state":
                 require(delay == self.lag, "the delay of a state is not the lag")
                 goal.entries[i][past + self.index("states", name)] = 1
@@ -267,7 +276,14 @@ class System:
 
     def rows_of(self, kinds):
         """Return the numbers of the rows of the observer that are of some kinds."""
+        require(isinstance(kinds, list) and set(kinds) <= set(ROW_KINDS), "there are no such rows")
         return [i for i, (kind, _, _) in enumerate(self.row_kinds) if kind in kinds]
+
+    def rows_of_each(self, kinds):
+        """Return the same, and refuse kinds without rows: a sentence names them all."""
+        rows = self.rows_of(kinds)
+        require(kinds and {self.row_kinds[i][0] for i in rows} == set(kinds), "there are no such rows")
+        return rows
 
     def identities(self):
         """Return what must vanish, and the sum of the absolute values of its terms, by name.
@@ -372,7 +388,15 @@ def identities_hold(system, claim):
     for name, (missed, sizes) in system.identities().items():
         if name in ("K", "U", "J", "L"):
             require_small(missed, sizes, share, floor, f"identity {name}")
-    return f"without faults, z follows T E x, and the rows what they stand for, to {shown(share)} of all terms"
+    return (
+        f"without faults, z follows T E x, and the rows what they stand for, to {shown(share)} of all terms"
+        f"{shown_floor(share, floor)}"
+    )
+
+
+def shown_floor(share, floor):
+    """Return what small entries are compared with, in words."""
+    return f", or to {shown(share * floor)} of the largest of their column" if floor else ""
 
 
 def lyapunov(system, claim, rate, a):
@@ -430,8 +454,8 @@ def stable(system, claim):
     require(0 < value < 1 if system.discrete else value >= 0, "the rate is none of decay")
     lyapunov(system, claim, rate, system.Az)
     if system.discrete:
-        return f"every error decays, faster than (1 - {shown(1 - value, down=True)})^k"
-    return f"every error decays, faster than exp(-{shown(value, down=True)} t)" if value else "every error decays"
+        return f"every mode of Az decays, faster than (1 - {shown(1 - value, down=True)})^k"
+    return f"every mode of Az decays, faster than exp(-{shown(value, down=True)} t)" if value else "every mode decays"
 
 
 def gain_is_below(system, claim):
@@ -442,9 +466,8 @@ def gain_is_below(system, claim):
     time the derivative of V is in the place of ``V(e+) - V(e)``.  With s = 0 it is a Lyapunov inequality.  States after
     the first ``states`` ones are left out where neither those nor the rows depend on them.
     """
-    gamma, first = read_matrix(claim["gamma"]), int(claim["states"])
-    rows, core = system.rows_of(claim["rows"]), list(range(first))
-    require(rows and 0 <= first <= system.Az.rows, "there are no such rows or states")
+    gamma, first = read_matrix(claim["gamma"]), read_count(claim["states"], "the states", most=system.Az.rows)
+    rows, core = system.rows_of_each(claim["rows"]), list(range(first))
     beyond = list(range(first, system.Az.rows))
     require(system.Az.part(core, beyond).is_zero() and system.Cz.part(rows, beyond).is_zero(), "states were left out")
     require(gamma.number() > 0, "gamma is not positive")
@@ -479,8 +502,8 @@ def deviation_is_below(system, claim):
     moved = a @ x
     rest = x - moved @ a.T - b @ b.T if system.discrete else -(moved + moved.T) - b @ b.T
     require_positive_definite(rest, claim["covers"], "the covariance inequality")
-    rows = system.rows_of(claim["rows"])
-    require(rows and (bounds.rows, bounds.columns) == (len(rows), 1), "there is not a bound for each row")
+    rows = system.rows_of_each(claim["rows"])
+    require((bounds.rows, bounds.columns) == (len(rows), 1), "there is not a bound for each row")
     for place, i in enumerate(rows):
         c, through = system.Cz.part([i]), d.part([i])
         require(system.discrete or through.is_zero(), "white noise of infinite variance reaches a row")
@@ -532,6 +555,7 @@ def faults_are_estimated(system, claim):
     contraction, bounds, (b, d) = system.contraction(), read_matrix(claim["bounds"]), system.driven("faults")
     delays = {name: delay for kind, name, delay in system.row_kinds if kind == "fault"}
     require(set(delays) == set(system.names["faults"]), "not every fault is estimated")
+    require(len(delays) == len(system.rows_of(["fault"])), "a fault has two estimates")
     require(min(delays.values()) >= 1, "a fault is estimated without delay")
     missed, trace = d.absolute(), b
     for step in range(1, max(delays.values()) + 1):
@@ -561,8 +585,14 @@ def fault_models_are_followed(system, claim):
     are of the errors for model states w within one at all times: what the equation of Pi misses drives a difference.
     """
     phi, cw, pi = (read_matrix(claim[name]) for name in ("Phi", "Cw", "Pi"))
-    delay, mean, bounds = int(claim["delay"]), int(claim["mean"]), read_matrix(claim["bounds"])
-    require(0 <= delay <= 10_000 and 1 <= mean <= 10_000, "delay and mean are no numbers of samples")
+    delay, mean = (read_count(claim[name], f"the {name}", most=10_000) for name in ("delay", "mean"))
+    bounds, estimates = read_matrix(claim["bounds"]), system.rows_of(["fault"])
+    require(mean >= 1, "a mean is of one sample at least")
+    require(phi.rows == phi.columns == cw.columns and cw.rows == system.Bf.columns, "Phi and Cw do not fit")
+    require(estimates, "no fault is estimated")
+    for i in estimates:
+        own = cw.part([system.index("faults", system.row_kinds[i][1])])
+        require(not own.is_zero(), f"{system.row_kinds[i][1]} has no model")
     require(system.discrete or (delay == 0 and mean == 1), "a delay needs samples")
     b, d = system.driven("faults")
     drives = system.Az @ pi - b @ cw - pi @ phi
@@ -583,8 +613,9 @@ def fault_models_are_followed(system, claim):
             size = abs(wanted.fraction(i, j)) / mean
             require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
     after = f", {delay} samples late" if delay else ""
+    still = (phi - Matrix.identity(phi.rows) if system.discrete else phi).is_zero()
     return (
-        f"faults that follow their models are estimated as they are{after}, to "
+        f"faults that {'are constant' if still else 'follow w+ = Phi w'} are estimated as they are{after}, to "
         f"{shown(max(entries_of(bounds), default=0))} per unit of a model's state"
     )
 
@@ -624,7 +655,10 @@ def plant_follows(system, claim):
     ):
         sizes = total([part.absolute() for part in parts])
         require_small(total(parts), sizes, share, floor, "the equations as written")
-    return f"the plant is the one as written without its algebraic states, to {shown(share)} of all terms"
+    return (
+        f"the plant is the one as written without its algebraic states, to {shown(share)} of all terms"
+        f"{shown_floor(share, floor)}"
+    )
 
 
 def require_small(missed, sizes, share, floor, what):
@@ -652,13 +686,36 @@ class Window:
     def __init__(self, system, question):
         require(system.discrete, "a window needs samples")
         self.system, self.question = system, question
-        self.samples, self.prior, self.equations = (int(question[key]) for key in ("samples", "prior", "equations"))
-        require(self.samples >= 1 and self.prior >= 0 and self.equations >= 0, "the window has no samples")
-        require(self.samples + self.prior + self.equations <= 100_000, "the window is too long")
+        self.samples, self.prior, self.equations, self.fault, self.lag, self.before = (
+            read_count(question[key], key) for key in ("samples", "prior", "equations", "fault", "lag", "before")
+        )
+        require(self.samples >= 1, "the window has no samples")
+        require(self.samples + self.prior + self.equations <= LARGEST_COUNT, "the window is too long")
+        require(self.fault < system.Bf.columns, "there is no such fault")
+        require(max(self.lag, self.before) < self.samples, "the fault begins, or is looked for, outside of the window")
+        require(question["norm"] in ("box", "ellipsoid"), "the norm is unknown")
+        self.free = [read_count(fault, "a free fault", most=system.Bf.columns - 1) for fault in question["free"]]
         self.G, self.H = read_matrix(question["noise_state"]), read_matrix(question["noise_output"])
+        shapes = (self.G.rows, self.G.columns), (self.H.rows, self.H.columns)
+        require(shapes == ((system.E.rows, self.G.columns), (system.C.rows, self.G.columns)), "the noise does not fit")
+        self.limits = self.read_limits()
         self.bounds, self.groups, self.entries, self.offsets = [], [], [], []
         self.row_count = self.equations * system.E.rows + self.samples * system.C.rows
         self.fill()
+
+    def read_limits(self):
+        """Read the bounds, one for each signal; only states and rates of change may have none."""
+        system = self.system
+        n, nd, nw = system.E.rows, system.Bd.columns, self.G.columns
+        counts = {"disturbances": nd, "noise": nw, "states": n, "first": n, "rates": nd, "fault_rate": 1}
+        given, middles = self.question["bounds"], self.question["middles"]
+        require(set(given) == set(counts) and set(middles) == {"disturbances", "noise"}, "bounds are missing")
+        require(all(len(given[name]) == count for name, count in counts.items()), "each signal needs a bound")
+        require(all(len(values) == counts[name] for name, values in middles.items()), "each bound needs a middle")
+        limits = {name: [None if v is None else read_matrix(v).number() for v in values]
+                  for name, values in given.items()}  # fmt: skip
+        require(None not in limits["disturbances"] + limits["noise"], "each signal needs a bound")
+        return limits
 
     def column(self, bound, group=None):
         """Add an entry of z with its bound (none: free), and return its number."""
@@ -695,11 +752,7 @@ class Window:
 
     def fill(self):
         """Form M."""
-        system, question = self.system, self.question
-        bounds = {
-            name: [None if v is None else read_matrix(v).number() for v in values]
-            for name, values in question["bounds"].items()
-        }
+        system, question, bounds = self.system, self.question, self.limits
         span = range(-self.prior, max(self.equations - self.prior, self.samples))
         self.theta = self.column(None)
         n = system.E.rows
@@ -727,13 +780,13 @@ class Window:
                     self.acts(k, self.G, self.H, i, self.column(bound, ("w", k)))
         self.disturb(bounds, span)
         self.look_for(bounds, span)
-        for fault in question["free"]:
-            require(int(fault) != int(question["fault"]), "the fault that is looked for is free")
+        for fault in self.free:
+            require(fault != self.fault, "the fault that is looked for is free")
             column = None
             for k in span:
                 if column is None or question["free_course"] == "any":
                     column = self.column(None)
-                self.acts(k, system.Bf, system.Df, int(fault), column)
+                self.acts(k, system.Bf, system.Df, fault, column)
         require(question["free_course"] in ("any", "constant"), "the course of free faults is unknown")
         self.move_middles(bounds, span)
 
@@ -743,10 +796,8 @@ class Window:
         require(kind in ("any", "jump", "held", "rate"), "the course of disturbances is unknown")
         require(between is None or kind in ("any", "rate"), "disturbances that are held do not move between samples")
         replaced = between["replaced"] if between else []
-        require(len(bounds["disturbances"]) == system.Bd.columns, "each disturbance needs a bound")
         for i, bound in enumerate(bounds["disturbances"]):
             before = column = None
-            require(bound is not None, "each disturbance needs a bound")
             for k in span if bound else ():
                 if column is None or kind != "held":
                     column = self.column(bound, ("d", k) if kind in ("any", "jump") else None)
@@ -768,24 +819,44 @@ class Window:
         require(len(bounds) == len(between["groups"]) == columns.columns, "each column needs a bound and a group")
         for k in range(-self.prior, self.equations - self.prior):
             for j, (bound, group) in enumerate(zip(bounds, between["groups"], strict=True)):
-                column = self.column(bound, None if group is None else ("moving", k, int(group)))
+                column = self.column(bound, None if group is None else ("moving", k, read_integer(group)))
                 for r in range(columns.rows):
                     self.put(self.equation(k, r), column, -columns.fraction(r, j))
 
-    @property
-    def assumed(self):
-        """What is assumed of disturbances between samples, and not proved here."""
-        if any(
-            bound is not None and read_matrix(bound).entries[0] for bound in self.question["bounds"]["disturbances"]
-        ):
-            moving = self.question.get("between_samples")
-            return ", for disturbances that " + ("act as its columns say" if moving else "are held between samples")
-        return ""
+    def assumed(self, down):
+        """Return what is assumed of the signals, and not proved here; bounds are rounded to the safe side."""
+        system, question = self.system, self.question
+        disturbances, noise, states = (self.limits[kind] for kind in ("disturbances", "noise", "states"))
+        middles = {kind: [read_matrix(v).number() for v in values] for kind, values in question["middles"].items()}
+
+        def within(bound, middle=0):
+            return f"within {shown(bound, down)}" + (f" of {shown(middle)}" if middle else "")
+
+        names = system.names["disturbances"]
+        parts = [
+            f"{name} {within(*pair)}" for name, *pair in zip(names, disturbances, middles["disturbances"], strict=True)
+        ]
+        parts += [f"noise {i + 1} {within(*pair)}" for i, pair in enumerate(zip(noise, middles["noise"], strict=True))]
+        bounded = [*zip(system.names["states"], states, strict=True)]
+        bounded += [
+            (f"{name} at first", bound)
+            for name, bound in zip(system.names["states"], self.limits["first"], strict=True)
+        ]
+        parts += [f"{name} {within(bound)}" for name, bound in bounded if bound is not None]
+        others = [name for i, name in enumerate(system.names["faults"]) if i not in (self.fault, *self.free)]
+        parts += [f"no {name}" for name in others]
+        parts += ["disturbances and noise of a sample in an ellipsoid"] if question["norm"] == "ellipsoid" else []
+        if any(disturbances):
+            kinds = {"held": "disturbances that are constant", "rate": "disturbances with bounded changes"}
+            parts += [kinds[question["disturbance"]]] if question["disturbance"] in kinds else []
+            moving = question.get("between_samples")
+            parts.append("disturbances that " + ("act as its columns say" if moving else "are held between samples"))
+        return ", for " + ", ".join(parts) if parts else ""
 
     def look_for(self, bounds, span):
         """The fault that is looked for: what theta does, and what else this fault may do."""
-        system, course, fault = self.system, self.question["course"], int(self.question["fault"])
-        target = self.samples - 1 - int(self.question["lag"])
+        system, course, fault = self.system, self.question["course"], self.fault
+        target = self.samples - 1 - self.lag
         require(course in ("step", "constant", "any", "ramp", "rate"), "the course of the fault is unknown")
 
         def acts(k, column, times=1):
@@ -793,7 +864,7 @@ class Window:
 
         slope = self.column(None) if course == "ramp" else None
         for k in span:
-            if course != "any" and not (course == "step" and k < int(self.question["before"])):
+            if course != "any" and not (course == "step" and k < self.before):
                 acts(k, self.theta)
             if course == "ramp":
                 acts(k, slope, k - target)
@@ -905,17 +976,19 @@ def threshold_holds(system, claim):
     require(not any(seen[j] for j in free), "a signal without a bound reaches the test")
     seen[window.theta] = Fraction(0)
     require(window.largest(seen) <= threshold, "the threshold is not proved")
-    require_weights_run(system, claim, window, multipliers)
+    added, offset = require_weights_run(system, claim, window, multipliers)
     return (
-        f"without {system.names['faults'][int(claim['window']['fault'])]}, its test never passes {shown(threshold)} "
-        f"(and the rounding of its weights){window.assumed}; a fault of twice that passes it"
+        f"without {system.names['faults'][window.fault]}, its test never passes {shown(threshold)} (and what rounding "
+        f"of its weights adds: at most {shown(offset)}, and {shown(added)} per unit of any input or output), and a "
+        f"fault ({claim['window']['course']}) of twice that passes it{window.assumed(down=True)}"
     )
 
 
 def require_weights_run(system, claim, window, multipliers):
-    """Refuse unless the observer's row has the weights of the multipliers, but for rounding."""
-    row, rounding = int(claim["row"]), [read_matrix(value).number() for value in claim["rounding"]]
-    require(0 <= row < system.Cz.rows and len(rounding) == system.B.columns + system.C.rows, "there is no such row")
+    """Refuse unless the observer's row has the weights of the multipliers; return what rounding adds, at most."""
+    row, rounding = read_count(claim["row"], "the row"), [read_matrix(value).number() for value in claim["rounding"]]
+    require(row < system.Cz.rows and len(rounding) == system.B.columns + system.C.rows, "there is no such row")
+    require(system.row_kinds[row][1] == system.names["faults"][window.fault], "the row is of another fault")
     on_y, on_u = window.weights(multipliers)
     used = [k for k in on_y if any(on_y[k]) or any(on_u[k])]
     last, state = max([*used, window.samples - 1]), system.Cz.part([row])
@@ -933,10 +1006,9 @@ def require_weights_run(system, claim, window, multipliers):
         "the weights that run are not those of the multipliers",
     )
     constant = -sum((m * offset for m, offset in zip(multipliers, window.offsets, strict=True)), Fraction(0))
-    require(
-        abs(read_matrix(claim["constant"]).number() - constant) <= read_matrix(claim["constant_rounding"]).number(),
-        "the constant of the test is another one",
-    )
+    added = read_matrix(claim["constant_rounding"]).number()
+    require(abs(read_matrix(claim["constant"]).number() - constant) <= added, "the constant of the test is another one")
+    return max(rounding, default=Fraction(0)), added
 
 
 def least_is_hidden(system, claim):
@@ -956,11 +1028,11 @@ def least_is_hidden(system, claim):
             if claim["window"]["norm"] == "ellipsoid" and window.groups[j] is not None and bound:
                 groups[window.groups[j]] = groups.get(window.groups[j], 0) + (value / bound) ** 2
     require(all(value <= 1 for value in groups.values()), "the point violates a bound")
-    fault = system.names["faults"][int(claim["window"]["fault"])]
+    fault = f"{system.names['faults'][window.fault]} ({claim['window']['course']})"
     begun = f"begins {window.prior} samples before the window" if window.prior else "begins with the window"
     return (
         f"for a plant that {begun}, no function of {window.samples} samples estimates {fault} to within "
-        f"less than {shown(least, down=True)}{window.assumed}"
+        f"less than {shown(least, down=True)}{window.assumed(down=False)}"
     )
 
 
@@ -993,13 +1065,15 @@ def alarm_is_right(system, claim):
     require(abs(value) >= (1 + margin) * allowed, "the samples may occur without the fault")
     return (
         f"the {window.samples} samples of the alarm cannot occur without "
-        f"{system.names['faults'][int(claim['window']['fault'])]}: all bounds would have to be exceeded by "
-        f"{shown(margin * 100, down=True)} %{window.assumed}"
+        f"{system.names['faults'][window.fault]}: all bounds would have to be exceeded by "
+        f"{shown(margin * 100, down=True)} %{window.assumed(down=True)}"
     )
 
 
 #: What reading a file raises that is not what the format says.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+#: Claims on the error system: they are about the observer's errors only where the identities hold.
+REST_ON_IDENTITIES = ("gain", "deviation", "faults", "fault models")
 CLAIMS = {
     "plant": plant_follows,
     "identities": identities_hold,
@@ -1027,11 +1101,25 @@ def read_integer(value):
     return value
 
 
+def read_count(value, what, most=LARGEST_COUNT):
+    """Read a number of things: from zero to a limit."""
+    number = read_integer(value)
+    require(0 <= number <= most, f"{what} is not from 0 to {most}")
+    return number
+
+
+def read_names(given, count, kind):
+    """Read the names of some signals: one for each, no two alike."""
+    require(isinstance(given, list) and all(isinstance(name, str) for name in given), f"names of {kind} are no texts")
+    require(len(given) == count == len(set(given)), f"the {kind} need a name each, no two alike")
+    return given
+
+
 def read_matrix(given):
     """Read a matrix: its size, its exponent, and its integers row by row (``entry * 2**exponent``)."""
-    rows, columns = (read_integer(value) for value in given["size"])
+    rows, columns = (read_count(value, "a size") for value in given["size"])
     exponent, entries = read_integer(given["exponent"]), given["entries"]
-    require(rows >= 0 and columns >= 0 and rows * columns == len(entries), "a matrix has another size than it says")
+    require(isinstance(entries, list) and rows * columns == len(entries), "a matrix has another size than it says")
     require(abs(exponent) <= LARGEST_EXPONENT, "an exponent is too large")
     integers = [read_integer(value) for value in entries]
     return Matrix(rows, columns, [integers[i * columns : (i + 1) * columns] for i in range(rows)], exponent)
@@ -1041,9 +1129,10 @@ def check(file):
     """Return for each claim its name, whether it is proved, and the sentence or the reason; and what is not covered."""
     require(isinstance(file, dict), "this is no proof file")
     require(file.get("format") == FORMAT, "this is no proof file")
-    require(file.get("version") == VERSION, f"the version of the file is not {VERSION}")
-    system = System(file)
-    require(file["claims"], "there are no claims")
+    require(read_integer(file.get("version")) == VERSION, f"the version of the file is not {VERSION}")
+    system, left = System(file), file.get("not_covered", [])
+    require(isinstance(file["claims"], list) and file["claims"], "there are no claims")
+    require(isinstance(left, list), "what is not covered is no list")
     verdicts = []
     for claim in file["claims"]:
         name = str(claim.get("claim"))
@@ -1054,7 +1143,32 @@ def check(file):
             verdicts.append((name, False, str(refused)))
         except UNREADABLE as error:
             verdicts.append((name, False, f"the claim cannot be read: {type(error).__name__} {error}"))
-    return verdicts, [str(text) for text in file.get("not_covered", [])]
+    follows = any(name == "identities" and proved for name, proved, _ in verdicts)
+    missing = "it is about errors only where the claim 'identities' is proved, too"
+    verdicts = [
+        (name, False, missing) if proved and name in REST_ON_IDENTITIES and not follows else (name, proved, text)
+        for name, proved, text in verdicts
+    ]
+    return verdicts, [str(text) for text in left]
+
+
+def read_file(path):
+    """Read JSON with integers alone, in which no name occurs twice: one reader might take the first, one the last."""
+
+    def unique(pairs):
+        require(len(dict(pairs)) == len(pairs), "a name occurs twice")
+        return dict(pairs)
+
+    def refuse(text):
+        raise Refused(f"{text} is no integer")
+
+    with open(path, encoding="utf-8") as stream:
+        return json.load(stream, object_pairs_hook=unique, parse_float=refuse, parse_constant=refuse)
+
+
+def on_one_line(text):
+    """Return a text of the file without what could pass for a line of this program."""
+    return "".join(letter if letter.isprintable() else "?" for letter in str(text))
 
 
 def main(arguments):
@@ -1063,17 +1177,19 @@ def main(arguments):
         print("usage: python -I check_proof.py proof.json", file=sys.stderr)
         return 2
     try:
-        with open(arguments[0], encoding="utf-8") as stream:
-            file = json.load(stream)
+        file = read_file(arguments[0])
         verdicts, left = check(file)
-    except (OSError, Refused, RecursionError, *UNREADABLE) as error:
-        print(f"Not a proof file that can be checked: {type(error).__name__}: {error}", file=sys.stderr)
+    except (OSError, Refused, RecursionError, MemoryError, *UNREADABLE) as error:
+        print(on_one_line(f"Not a proof file that can be checked: {type(error).__name__}: {error}"), file=sys.stderr)
         return 2
-    print(f"{file.get('about', '')}")
+    print(on_one_line(f"About (not checked): {file.get('about', '')}"))
     for name, proved, text in verdicts:
-        print(f"{'PROVED' if proved else 'NOT PROVED'}  {name}: {text}")
+        print(on_one_line(f"{'PROVED' if proved else 'NOT PROVED'}  {name}: {text}"))
     for text in left:
-        print(f"NOT COVERED by this file: {text}")
+        print(on_one_line(f"NOT COVERED by this file: {text}"))
+    print(
+        f"NOT CLAIMED by this file: {', '.join(sorted(set(CLAIMS) - {name for name, _, _ in verdicts})) or 'nothing'}"
+    )
     if all(proved for _, proved, _ in verdicts):
         print(f"All {len(verdicts)} claims are proved, for the numbers in this file.")
         return 0

@@ -28,6 +28,7 @@ from obsynth.exporting.independent import (
     checker_path,
 )
 from obsynth.exporting.proof_file import proof_bytes, proof_of, write_proof
+from obsynth.methods.registry import REGISTRY
 
 ROOT = Path(__file__).parents[2]
 CHECKER = ROOT / "checker/check_proof.py"
@@ -129,6 +130,20 @@ def test_a_file_of_integers_alone(method: str) -> None:
         return [] if isinstance(value, (str, bool)) or value is None else [value]
 
     assert {type(value) for value in numbers(proof(method))} == {int}
+
+
+def test_the_page_says_what_each_file_proves_and_leaves() -> None:
+    page = (ROOT / "docs/what_verified_means.md").read_text(encoding="utf-8")
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if line[:3] == "| `"]
+    table = {cells[0].strip("`"): cells[1:] for cells in lines if len(cells) == 3}
+    assert {method for method in table if "," not in method} == set(CLAIMS)
+    for method in CLAIMS:
+        file = proof(method)
+        assert table[method][0].split(", ") == [claim["claim"] for claim in file["claims"]]
+        assert table[method][1].split("; ") == file["not_covered"]
+    (others,) = (cells[0] for cells in lines if cells[-1] == "everything: they have no proof file")
+    named = {name.strip("`") for name in others.split(", ")}
+    assert named == set(REGISTRY) - set(CLAIMS)
 
 
 def test_what_an_optimal_filter_claims_besides_is_named() -> None:
