@@ -85,6 +85,38 @@ def test_what_it_is_not_for_is_refused(changes: dict[str, Any], kind: type[Excep
         turning_faults(turning_plant(**changes))
 
 
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"dt": 0.0}, "discrete time"),
+        ({"C": [["1 + v", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "same C"),
+        ({"Df": [[1], [0], [0]]}, "without"),
+        ({"Bd": [[1], [0], [0], [0]], "Dd": [[1], [0], [0]]}, "without"),
+    ],
+)
+def test_the_errors_are_of_plants_that_it_is_for(changes: dict[str, Any], told: str) -> None:
+    gains = {"T": np.eye(4), "K[1]": np.zeros((4, 3)), "K[2]": np.zeros((4, 3))}
+    with pytest.raises(PreconditionError, match=told):
+        turning_errors(turning_plant(**changes), gains)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"K[2]": np.zeros((3, 4))}, r"K\[2\] is 3 by 4"),
+        ({"T": np.full((4, 4), np.nan)}, "must be finite"),
+        ({"T": 0.5 * np.eye(4)}, "no N has T E"),
+    ],
+)
+def test_gains_of_another_plant_have_no_errors(changed: dict[str, Any], told: str) -> None:
+    gains = {"T": np.eye(4), "K[1]": np.zeros((4, 3)), "K[2]": np.zeros((4, 3))}
+    with pytest.raises(SpecError, match=told):
+        turning_errors(turning_plant(), {**gains, **changed})
+    del gains["T"]
+    with pytest.raises(SpecError, match="T is missing"):
+        turning_errors(turning_plant(), gains)
+
+
 def test_more_than_two_vertices_are_refused_by_name() -> None:
     given = turning_plant().as_dict()["plant"]
     given["Bf"] = [["1 - v"], ["v * w"], [0.3], [0.2]]

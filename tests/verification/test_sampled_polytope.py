@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import flint
 import numpy as np
 import pytest
 import scipy.linalg
@@ -118,3 +119,18 @@ def test_a_continuous_plant_over_a_region_is_not_told_to_be_sampled() -> None:
     assert "obsynth.discretise" not in str(caught.value)
     # What is printed was tried.
     assert obsynth.ui_pi_observer(plant).report.passed
+
+
+def test_the_rounding_of_a_times_dt_is_in_the_remainder() -> None:
+    """A lone vertex has no other remainder: e^(A dt) in many digits lies within it, A dt formed exactly."""
+    rng, dt = np.random.default_rng(50), 0.1
+    for _ in range(5):
+        a = rng.normal(size=(2, 2))
+        sampled = sampled_polytope(ErrorPolytope([a], [[1.0, 0.0]], dt=0.0), dt)
+        with flint.ctx.workprec(300):
+            exact = flint.arb_mat(2, 2, [flint.arb(float(x)) * flint.arb(dt) for x in a.ravel()]).exp()
+            missed = [abs(exact[i, j] - flint.arb(float(sampled.A[0][i, j]))) for i in range(2) for j in range(2)]
+            assert sum((m * m for m in missed), flint.arb(0)) < flint.arb(float(sampled.ball)) ** 2
+        # What one rounding of each product moves the exponential by.
+        least = 2.0**-54 * np.linalg.norm(dt * a) * np.exp(-np.linalg.norm(dt * a))
+        assert sampled.ball > least

@@ -32,8 +32,9 @@ from obsynth.conditions import lmi
 from obsynth.conditions.polytope import MOST_ROOM, TRACE
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind, shown
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import arguments_checked, require_kind, require_shape, shown
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_polytope import ErrorPolytope
@@ -152,7 +153,9 @@ def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> T
     Raises
     ------
     SpecError
-        Another kind of plant or gains, or another number of vertices.
+        Another kind of plant or gains, another number of vertices, gains of other sizes, or a T without an N.
+    PreconditionError
+        The plant is continuous, its outputs change, or they see faults or disturbances at once.
 
     Examples
     --------
@@ -167,10 +170,15 @@ def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> T
     """
     require_kind(plant, PolytopicSystem, "plant", "a PolytopicSystem")
     require_kind(gains, Mapping, "gains", "what gains() of turning_faults returns")
-    if plant.count != VERTICES or not {"T", "K[1]", "K[2]"} <= set(gains):
-        raise SpecError("Give a plant of two vertices, and T, K[1] and K[2].", path="gains")
-    C, T, eye = plant.vertices[0].C, gains["T"], np.eye(plant.nx)
-    K, A, leaks = [gains["K[1]"], gains["K[2]"]], [], []
+    _require_fitting(plant)
+    T, *K = (_gain(gains, name, plant) for name in ("T", "K[1]", "K[2]"))
+    C, eye = plant.vertices[0].C, np.eye(plant.nx)
+    rest = eye - T @ plant.vertices[0].E
+    missed = rest - rest @ np.linalg.pinv(C) @ C
+    if not np.abs(missed).max(initial=0.0) <= RANK_TOLERANCE * max(1.0, float(np.abs(rest).max(initial=0.0))):
+        raise SpecError("T: no N has T E + N C = I with it: take T of turning_faults.", path="T")
+    A: list[FloatArray] = []
+    leaks: list[float] = []
     largest = max(float(np.abs(T @ vertex.Bf).max(initial=0.0)) for vertex in plant.vertices)
     for i in range(VERTICES):
         for j in range(i, VERTICES):
@@ -182,15 +190,23 @@ def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> T
     return TurningErrors(errors, max(leaks) / largest if largest else 0.0)
 
 
-def _constant_parts(plant: PolytopicSystem) -> tuple[FloatArray, FloatArray]:
-    """Return T and N, after what the plant must be."""
+def _gain(gains: Mapping[str, FloatArray], name: str, plant: PolytopicSystem) -> FloatArray:
+    """Return a gain, which must be there and have its size."""
+    if name not in gains:
+        raise SpecError(f"{name} is missing: give T, K[1] and K[2].", path="gains")
+    gain = as_matrix(gains[name], name)
+    require_shape(gain.shape, (plant.nx, plant.nx if name == "T" else plant.ny), name)
+    return gain
+
+
+def _require_fitting(plant: PolytopicSystem) -> None:
+    """Raise where the error system of these gains is another one: the plant has two vertices and constant outputs."""
     if plant.count != VERTICES:
         raise SpecError(
             f"Exact decoupling of faults that turn is proved for two vertices, there are {plant.count}: take "
             "obsynth.ui_pi_observer, which estimates faults that follow a model.",
             path="plant",
         )
-    first = plant.vertices[0]
     changing = not plant.is_constant("C") or any(np.any(getattr(v, k)) for v in plant.vertices for k in ("Df", "Dd"))
     if not plant.is_discrete or changing:
         raise PreconditionError(
@@ -198,7 +214,12 @@ def _constant_parts(plant: PolytopicSystem) -> tuple[FloatArray, FloatArray]:
             "Df and Dd.",
             condition="faults that turn",
         )
-    prepared = prepare(plant.center, exactly=False)
+
+
+def _constant_parts(plant: PolytopicSystem) -> tuple[FloatArray, FloatArray]:
+    """Return T and N, after what the plant must be."""
+    _require_fitting(plant)
+    first, prepared = plant.vertices[0], prepare(plant.center, exactly=False)
     states = prepared.scaling.states[:, None]
     T = states * prepared.T * prepared.scaling.equations
     for vertex in plant.vertices:

@@ -15,6 +15,7 @@ this remainder beside A.  A parameter that moves within the sample has the trans
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.affine import AffineMatrix, affine_exponential
+from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.verification.error_polytope import ErrorPolytope
 
 #: By how much bounds are larger than computed, for all rounding of a few norms and eigenvalues.
@@ -66,7 +68,7 @@ def sampled_polytope(errors: ErrorPolytope, dt: float) -> ErrorPolytope:
             "Inputs of the errors, and outputs that change, are not sampled here: give A at the vertices, and one C.",
             path="errors",
         )
-    made = [affine_exponential(AffineMatrix.exact(dt * matrix, 0)) for matrix in errors.A]
+    made = [affine_exponential(_times(dt, matrix)) for matrix in errors.A]
     rounding = max(float(np.linalg.norm(matrix.radius)) for matrix in made)
     diameter = max(float(np.linalg.norm(one - other)) for one in errors.A for other in errors.A)
     share = (1.0 - 1.0 / errors.count) / 4.0
@@ -101,6 +103,12 @@ def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float
     real_number(dt, "dt", "a positive number of seconds", above=0.0)
     real_number(rate, "rate", "a positive number", above=0.0)
     return rate * dt**2 * _growth(errors, dt) / 2.0 * _ROOM
+
+
+def _times(dt: float, matrix: FloatArray) -> AffineMatrix:
+    """Return a matrix times a number, with what rounding of the products leaves."""
+    product = AffineMatrix.exact(dt * matrix, 0)
+    return replace(product, radius=np.nextafter(UNIT_ROUNDOFF * np.abs(product.center), np.inf))
 
 
 def _growth(errors: ErrorPolytope, dt: float) -> float:
