@@ -33,6 +33,8 @@ CLEANED_SHARES = (1e-13, 1e-8)
 DISTURBANCE_LEFT = 1e-8
 #: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
 ROUNDING_SHARE = 1e-14
+#: What passes at once and is smaller, of what passes by way of the states, is rounding: it is a difference of products.
+PASSED_ROUNDING = 1e-12
 #: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
 ROUNDED_MODE = 1e-12
 #: Sweeps over all states until their units are balanced, but for a factor.
@@ -67,7 +69,7 @@ def minimal(filter_: Model, *, discrete: bool = False) -> Model:
     basis = reachable_basis(a.T, c.T)
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
     passed = float(np.linalg.norm(d) + np.linalg.norm(c) * np.linalg.norm(b))
-    return _cleaned(a), _cleaned(b), _cleaned(c), _cleaned(d, passed)
+    return _cleaned(a), _cleaned(b), _cleaned(c), np.where(np.abs(d) > PASSED_ROUNDING * passed, d, 0.0)
 
 
 def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list[Model]:
@@ -119,10 +121,9 @@ def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.boo
     return found
 
 
-def _cleaned(matrix: FloatArray, size: float = 0.0) -> FloatArray:
-    """Return a matrix without entries that are rounding, of its largest or of ``size``."""
-    least = ROUNDING_SHARE * max(size, float(np.max(np.abs(matrix), initial=0.0)))
-    return np.where(np.abs(matrix) > least, matrix, 0.0)
+def _cleaned(matrix: FloatArray) -> FloatArray:
+    """Return a matrix without entries that are rounding of its largest."""
+    return np.where(np.abs(matrix) > ROUNDING_SHARE * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
 def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) -> Followed:
