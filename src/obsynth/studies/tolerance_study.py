@@ -97,7 +97,10 @@ class ToleranceStudy:
             tolerance for tolerance, alarms in zip(self.tolerances, self.false_alarms, strict=True) if alarms[0] > 0.0
         ]
         if not alarming:
-            return f"The {FIXED} had no false alarm in these runs; of the {ADAPTIVE} it is proved that it has none."
+            return (
+                f"The {FIXED} had no false alarm in these runs; the {ADAPTIVE} has none, proved, while constants, "
+                "disturbances and noise stay within their bounds."
+            )
         blind = [
             tolerance
             for tolerance, least in zip(self.tolerances, self.least_faults, strict=True)
