@@ -107,15 +107,15 @@ def proof_of(design: ObserverDesign) -> dict[str, Any]:
             "methods with constant matrices. `obsynth verify` checks it.",
             path="design",
         )
-    found = _Proof(design)
-    found.collect()
-    if not found.claims:
+    proof = _Proof(design)
+    proof.collect()
+    if not proof.claims:
         raise PreconditionError(
-            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(found.left)}. "
+            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(proof.left)}. "
             "`obsynth verify` checks it.",
             condition="proof file",
         )
-    return found.data()
+    return proof.data()
 
 
 def write_proof(design: ObserverDesign, path: str | Path) -> Path:
@@ -237,16 +237,16 @@ class _Proof:
         rates = [] if not decay or not np.isfinite(decay) else [decay * (1.0 - RATE_SHARE)]
         rates = [float(np.nextafter(np.exp(-rate * dt), 1.0)) for rate in rates] if dt > 0.0 else rates
         for rate in [*rates, *system.rates(STABILITY_SHARES)]:
-            if (found := lyapunov_witness(system.az, system.units, rate, discrete=dt > 0.0)) is not None:
-                return {"claim": "stable", "rate": number_data(rate), **_written(found)}
+            if (witness := lyapunov_witness(system.az, system.units, rate, discrete=dt > 0.0)) is not None:
+                return {"claim": "stable", "rate": number_data(rate), **_written(witness)}
         return None
 
     def _add_contraction(self, system: _Exact) -> None:
-        found = system.contraction()
-        if found is None:
+        contraction_and_witness = system.contraction()
+        if contraction_and_witness is None:
             self.left.append("what rounding of stored numbers adds: no contraction was found")
             return
-        contraction, self.witness = found
+        contraction, self.witness = contraction_and_witness
         self._add("what rounding of stored numbers adds: too much for an estimate", system.rounding_claim(contraction))
         discrete = self.plant.dt > 0.0
         if self.design.method == "fault-estimation-filter" and discrete:
@@ -294,8 +294,8 @@ def rows_of(observer: LinearObserver) -> list[tuple[str, str, int]]:
 
 def dual_matrix(p: FloatArray, gain: float) -> Dyadic | None:
     """Return ``gain^2`` times the inverse: it proves of a system what p proves of the transposed one."""
-    found = inverse(Dyadic.of(p))
-    return None if found is None else found.scaled(gain).scaled(gain)
+    inverse_p = inverse(Dyadic.of(p))
+    return None if inverse_p is None else inverse_p.scaled(gain).scaled(gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +345,7 @@ class _Exact:
             _exact(part) for part in (observer.By, observer.Dy, self.plant.D, observer.Bu, observer.Du, model.goal)
         )
         te = t @ e
-        found = {
+        residuals = {
             "K": [self.az @ te, by @ c, -(t @ a)],
             "U": [bu, by @ d, -(t @ b)],
             "J": [self.cz @ te, dy @ c, self.t0 @ a, -goal],
@@ -362,12 +362,12 @@ class _Exact:
         }
         if model.decoupled:
             bd, dd = _exact(model.Bd), _exact(model.Dd)
-            found |= {"V": [by @ dd, -(t @ bd)], "W": [dy @ dd, self.t0 @ bd]}
+            residuals |= {"V": [by @ dd, -(t @ bd)], "W": [dy @ dd, self.t0 @ bd]}
             sizes |= {
                 "V": [size(by) @ size(dd), size(t) @ size(bd)],
                 "W": [size(dy) @ size(dd), size(self.t0) @ size(bd)],
             }
-        return {name: (_sum(found[name]), _sum(sizes[name])) for name in found}
+        return {name: (_sum(residuals[name]), _sum(sizes[name])) for name in residuals}
 
     def identities_claim(self) -> dict[str, Any] | None:
         share = max((_share(*both) for name, both in self.missed.items() if name in IDENTITIES), default=Fraction(0))
@@ -380,35 +380,35 @@ class _Exact:
         """Return the contraction with the smallest bounds of a few, and the same as data of the file."""
         best, least = None, np.inf
         for units in (self.units, np.ones(self.observer.order)):
-            if (found := self._contraction(units)) is not None:
-                bounds = found[0].bounds(self.missed["K"][0], self.missed["J"][0].absolute())
+            if (candidate := self._contraction(units)) is not None:
+                bounds = candidate[0].bounds(self.missed["K"][0], self.missed["J"][0].absolute())
                 if best is None or np.max(bounds, initial=0.0) < least:
-                    best, least = found, float(np.max(bounds, initial=0.0))
+                    best, least = candidate, float(np.max(bounds, initial=0.0))
         return best
 
     def _contraction(self, units: FloatArray) -> tuple[_Contraction, dict[str, Any]] | None:
         for rate in self.rates(CONTRACTION_SHARES):
-            found = lyapunov_witness(self.az, units, rate, discrete=self.discrete)
-            inverted = None if found is None else inverse_above(found["P"])
-            if found is not None and inverted is not None:
+            witness = lyapunov_witness(self.az, units, rate, discrete=self.discrete)
+            inverted = None if witness is None else inverse_above(witness["P"])
+            if witness is not None and inverted is not None:
                 g, covers = inverted
-                data = {"rate": number_data(rate), **_written(found), "G": g.data(), "G_covers": covers}
+                data = {"rate": number_data(rate), **_written(witness), "G": g.data(), "G_covers": covers}
                 slowness = 1 - Fraction(rate) if self.discrete else Fraction(rate)
-                return _Contraction(self.cz, found["P"], g, slowness), data
+                return _Contraction(self.cz, witness["P"], g, slowness), data
         return None
 
     def rounding_claim(self, contraction: _Contraction) -> dict[str, Any] | None:
-        found = self.missed
-        if not self.discrete and any(map(bool, found["Z"][0].integers.entries())):
+        residuals = self.missed
+        if not self.discrete and any(map(bool, residuals["Z"][0].integers.entries())):
             return None
-        own = {name: found[name][0].absolute() for name in ("J", "L", "W") if name in found}
-        own["J"] = own["J"] + found["Z"][0].absolute()
+        own = {name: residuals[name][0].absolute() for name in ("J", "L", "W") if name in residuals}
+        own["J"] = own["J"] + residuals["Z"][0].absolute()
         bounds = {
-            "states": contraction.bounds(found["K"][0], own["J"]),
-            "inputs": contraction.bounds(found["U"][0], own["L"]),
+            "states": contraction.bounds(residuals["K"][0], own["J"]),
+            "inputs": contraction.bounds(residuals["U"][0], own["L"]),
         }
         if self.model.decoupled:
-            bounds["disturbances"] = contraction.bounds(found["V"][0], own["W"])
+            bounds["disturbances"] = contraction.bounds(residuals["V"][0], own["W"])
         count = 0 if self.model.Phi is None else len(self.model.Phi)
         rows = self.observer.fault_rows
         if count:
@@ -548,12 +548,12 @@ class _Contraction:
     def bounds_beside(self, columns: Dyadic, own: list[list[Fraction]]) -> FloatArray:
         heights = [_entry(self.cz @ self.g @ self.cz.T, i) for i in range(self.cz.shape[0])]
         lengths = [_entry(columns.T @ self.p @ columns, j) for j in range(columns.shape[1])]
-        found = np.zeros((len(heights), len(lengths)))
+        bounds = np.zeros((len(heights), len(lengths)))
         for i, height in enumerate(heights):
             for j, length in enumerate(lengths):
                 added = Fraction(root_above(height * length / self.slowness**2))
-                found[i, j] = rounded_outward((own[i][j] + added) * Fraction(BOUND_ROOM))
-        return found
+                bounds[i, j] = rounded_outward((own[i][j] + added) * Fraction(BOUND_ROOM))
+        return bounds
 
 
 def _exact(matrix: Any) -> Dyadic:

@@ -56,8 +56,8 @@ def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepG
     graphs, key = functions.model.graphs, (functions.method, dt, largest_move)
     if key not in graphs:
         graphs[key] = _graph(functions, dt, largest_move)
-    found: StepGraph = graphs[key]
-    return found
+    graph: StepGraph = graphs[key]
+    return graph
 
 
 def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
@@ -95,8 +95,8 @@ def input_effect(functions: DAEFunctions, dt: float) -> Any:
     scaled, rows = equilibrated(J, sizes)
     right = -ca.densify(ca.jacobian(value, point[2]))
     moved = ca.repmat(ca.DM(sizes), 1, model.nu) * solved(scaled, ca.repmat(rows, 1, model.nu) * right)
-    found = ca.Function("input_effect", point, [moved[n - model.nx :, :]])
-    return found.expand() if n <= SMALL else found
+    effect = ca.Function("input_effect", point, [moved[n - model.nx :, :]])
+    return effect.expand() if n <= SMALL else effect
 
 
 def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> Any:
@@ -137,8 +137,8 @@ def _iteration(newton: Any, sizes: FloatArray) -> Any:
     residual = ca.if_else(done, residual, ca.mmax(reached))
     X, value, rows, move = (ca.if_else(done, old, new) for old, new in zip((X, value, rows, move), after, strict=True))
     done = ca.logic_or(done, ca.logic_or(last, ca.logic_not(smaller)))
-    found = ca.Function("iteration", [*inputs, *point], [X, value, rows, move, done, converged, residual])
-    return found.expand() if len(sizes) <= SMALL else found
+    iteration = ca.Function("iteration", [*inputs, *point], [X, value, rows, move, done, converged, residual])
+    return iteration.expand() if len(sizes) <= SMALL else iteration
 
 
 def _block(iteration: Any, count: int) -> Any:
@@ -147,8 +147,8 @@ def _block(iteration: Any, count: int) -> Any:
     state, point = inputs[: iteration.n_out()], inputs[iteration.n_out() :]
     for _ in range(count):
         state = iteration(*state, *point)
-    found = ca.Function("iterations", inputs, state)
-    return found.expand() if iteration.is_a("SXFunction") else found
+    iterations = ca.Function("iterations", inputs, state)
+    return iterations.expand() if iteration.is_a("SXFunction") else iterations
 
 
 def _all(conditions: Any) -> Any:
@@ -200,13 +200,13 @@ class ImplicitStep:
     ) -> Solution:
         """Return the state after one step, by damped Newton and by a homotopy where that is needed."""
         start = np.tile(x, self.functions.stages)
-        found = self._newton(start, x, u, theta)
-        if found.converged and self._move(found.x, start) <= self.largest_move:
-            return self._solution(found, 1)
+        whole_step = self._newton(start, x, u, theta)
+        if whole_step.converged and self._move(whole_step.x, start) <= self.largest_move:
+            return self._solution(whole_step, 1)
         if before is None or np.array_equal(before, u):
-            if found.converged:
-                return self._solution(found, 1)
-            raise self._error(found, k, "")
+            if whole_step.converged:
+                return self._solution(whole_step, 1)
+            raise self._error(whole_step, k, "")
         return self._homotopy(start, x, before, u, theta, k)
 
     def sensitivities(
@@ -234,21 +234,21 @@ class ImplicitStep:
         self, start: FloatArray, x: FloatArray, before: FloatArray, u: FloatArray, theta: FloatArray, k: int
     ) -> Solution:
         """Lead the input from its last value to the new one, as fast as Newton follows."""
-        found = self._newton(start, x, before, theta)
-        if not found.converged:
-            raise self._error(found, k, " (with the input of the step before)")
+        last = self._newton(start, x, before, theta)
+        if not last.converged:
+            raise self._error(last, k, " (with the input of the step before)")
         reached, fraction, subsolves = 0.0, FIRST_FRACTION, 1
         while reached < 1.0:
             target = min(1.0, reached + fraction)
-            tried = self._newton(found.x, x, before + target * (u - before), theta)
+            tried = self._newton(last.x, x, before + target * (u - before), theta)
             subsolves += 1
-            if tried.converged and self._move(tried.x, found.x) <= self.largest_move:
-                found, reached, fraction = tried, target, 2.0 * fraction
+            if tried.converged and self._move(tried.x, last.x) <= self.largest_move:
+                last, reached, fraction = tried, target, 2.0 * fraction
             else:
                 fraction *= 0.5
             if fraction < LEAST_FRACTION or subsolves > MOST_SUBSOLVES:
                 raise self._error(tried, k, f" (homotopy: {100 * reached:.3g} % of the change of the input)")
-        return self._solution(found, subsolves)
+        return self._solution(last, subsolves)
 
     def _solution(self, found: NewtonResult, subsolves: int) -> Solution:
         return Solution(found.x[-self.functions.model.nx :], found.x, found.residual, subsolves)
@@ -267,5 +267,5 @@ class ImplicitStep:
 
 def onto_constraint(model: DAEModel, x: FloatArray, u: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
     """Return a state on the algebraic equations: the given one ``x (nx,)`` where it is on them already."""
-    found = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt).solve_carefully(x, u, theta).x
-    return found if np.abs((found - x) / model.state_scales).max() > PROJECTION_NOTICE else x
+    projected = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt).solve_carefully(x, u, theta).x
+    return projected if np.abs((projected - x) / model.state_scales).max() > PROJECTION_NOTICE else x

@@ -171,13 +171,13 @@ class ErrorModel:
     def goal(self) -> FloatArray:
         """``(rows, na)``: what each row of the observer's output stands for."""
         observer, states = self.observer, self.plant.state_names
-        found = np.zeros((len(observer.Cz), len(self.E)))
+        goal = np.zeros((len(observer.Cz), len(self.E)))
         for row, name in enumerate(observer.state_names):
-            found[observer.state_rows.start + row, self.plant.nx * self.lag + states.index(name)] = 1.0
+            goal[observer.state_rows.start + row, self.plant.nx * self.lag + states.index(name)] = 1.0
         if self.Cw is not None:
             named = [self.plant.fault_names.index(name) for name in observer.fault_names]
-            found[observer.fault_rows, self.plant.nx * (self.lag + 1) :] = self.Cw[named]
-        return found
+            goal[observer.fault_rows, self.plant.nx * (self.lag + 1) :] = self.Cw[named]
+        return goal
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:
@@ -292,14 +292,14 @@ class ErrorModel:
             j, el, v = j + t0 @ a, el + t0 @ b, v + t0 @ exact(self.Bd)
             driven = t0 @ e
         missed = (az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ dd - t @ exact(self.Bd), v)
-        found = RemainderChannel(*(_as_ball(part) for part in missed))
+        remainder = RemainderChannel(*(_as_ball(part) for part in missed))
         if driven is None:
-            return found
+            return remainder
         # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
         ball = _as_ball(driven)
         left = np.where(_there(ball), ball.magnitude, 0.0)
         added = left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)
-        return replace(found, J=Ball(found.J.midpoint, found.J.radius + added)) if left.any() else found
+        return replace(remainder, J=Ball(remainder.J.midpoint, remainder.J.radius + added)) if left.any() else remainder
 
     @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -332,7 +332,7 @@ class ErrorModel:
         rows = [np.maximum(terms, LEAST_ROW * np.max(terms, initial=0.0)) for terms in sizes]
         inputs = size(observer.Bu) + by @ d + t @ size(self.B), size(observer.Du) + dy @ d + t0 @ size(self.B)
         disturbances = by @ dd + t @ size(self.Bd), dy @ dd + t0 @ size(self.Bd)
-        found = [
+        shares = [
             float(np.max(size(left.midpoint) * units / terms, initial=0.0))
             for left, terms in zip((channel.K, channel.J), rows, strict=True)
         ]
@@ -343,12 +343,12 @@ class ErrorModel:
                 for parts in ([size(part.midpoint) for part in left], terms)
             )
             scale = np.max(moved, axis=0, initial=0.0)
-            found.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))
+            shares.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))
         if self.T0 is not None:
             largest = np.max(t0 @ size(self.E) * units, axis=1, initial=0.0, keepdims=True)
             left_over = size(self.T0 @ self.E) * units / np.where(largest > 0.0, largest, 1.0)
-            found.append(float(np.max(left_over, initial=0.0)))
-        return max(found) if np.all(np.isfinite(found)) else np.nan
+            shares.append(float(np.max(left_over, initial=0.0)))
+        return max(shares) if np.all(np.isfinite(shares)) else np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,9 +361,9 @@ class ByNumbers(Generic[Made]):
 
     def of(self, numbers: tuple[FloatArray | None, ...], make: Callable[[], Made]) -> Made:
         """Return what was made of the same numbers, or make it."""
-        for others, found in self.known:
+        for others, value in self.known:
             if all(map(_same, numbers, others)):
-                return found
+                return value
         self.known.append((numbers, make()))
         return self.known[-1][1]
 
@@ -422,7 +422,7 @@ class RemainderChannel:
         pairs = ((self.K, self.J), (self.U, self.L), (self.W, self.V))
         rows = observer.fault_rows
         gains = absolute_gains(observer.Az, observer.Cz[rows], contraction)
-        found = []
+        errors = []
         for k, direct in pairs:
             bound = (
                 absolute_gains(observer.Az, observer.Cz, contraction, k)
@@ -434,8 +434,8 @@ class RemainderChannel:
             # Of what is nothing exactly nothing comes.
             seen = np.where(_there(direct), direct.magnitude, 0.0)
             bound = np.where(np.any(_there(k), axis=0), bound, 0.0) + seen
-            found.append(np.where(bound > 0.0, rounded_up(bound, 2), 0.0))
-        return tuple(found)
+            errors.append(np.where(bound > 0.0, rounded_up(bound, 2), 0.0))
+        return tuple(errors)
 
 
 def _there(ball: Ball) -> Any:
@@ -446,11 +446,11 @@ def _there(ball: Ball) -> Any:
 def _as_ball(part: Ball | ExtendedBall) -> Ball:
     if isinstance(part, Ball):
         return part
-    found = as_ball(part.content)
-    if found.midpoint.all():
-        return found
-    nothing = np.reshape([entry.is_zero() for entry in part.content.entries()], found.shape)
-    return Ball(np.where(nothing, 0.0, found.midpoint), np.where(nothing, 0.0, found.radius))
+    ball = as_ball(part.content)
+    if ball.midpoint.all():
+        return ball
+    nothing = np.reshape([entry.is_zero() for entry in part.content.entries()], ball.shape)
+    return Ball(np.where(nothing, 0.0, ball.midpoint), np.where(nothing, 0.0, ball.radius))
 
 
 @remembered

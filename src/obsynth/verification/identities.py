@@ -95,10 +95,10 @@ class Identity:
         allowed = EQUALITY_TOLERANCE * scale if allowance is None else EQUALITY_TOLERANCE * scale + allowance
         worst = divmod(int((missed / allowed).argmax()), total.shape[1])
         more = 0.0 if allowance is None else float(allowance[worst])
-        found = Residual(float(missed[worst]), float(scale[worst]), more)
+        own = Residual(float(missed[worst]), float(scale[worst]), more)
         if self.also is None:
-            return found
-        return max(found, self.also.residual(allowance), key=lambda item: item.severity)
+            return own
+        return max(own, self.also.residual(allowance), key=lambda item: item.severity)
 
     def _scale(self, size: FloatArray) -> FloatArray:
         if self.entrywise:
@@ -151,12 +151,12 @@ def _size(value: float) -> str:
 def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     """Return the identities that make the observer unbiased without faults and disturbances."""
     plain = _tracking_identities(model)
-    found, others = (_in_units(plain, model, scaling) for scaling in _balances(model.plant))
+    balanced, others = (_in_units(plain, model, scaling) for scaling in _balances(model.plant))
     return {
         name: identity
         if identity.units is None
         else replace(identity, also=replace(others[name], rough=STATE_SCALE_FACTOR))
-        for name, identity in found.items()
+        for name, identity in balanced.items()
     }
 
 
@@ -209,7 +209,7 @@ def _tracking_identities(model: ErrorModel) -> dict[str, Identity]:
 def _in_units(identities: dict[str, Identity], model: ErrorModel, scaling: Scaling) -> dict[str, Identity]:
     """Return the same identities where those of the states are judged in some units."""
     units, by = np.tile(scaling.states, model.lag + 1), np.abs(model.observer.By)
-    found = {
+    scaled = {
         name: replace(identity, units=units) if name in _OF_STATES else identity
         for name, identity in identities.items()
     }
@@ -217,5 +217,5 @@ def _in_units(identities: dict[str, Identity], model: ErrorModel, scaling: Scali
     taken = np.max(by / scaling.outputs, axis=1, keepdims=True)
     seen = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
     first, last = identities["dynamics"].factors
-    found["dynamics"] = replace(found["dynamics"], factors=(first, (taken, seen), last))
-    return found
+    scaled["dynamics"] = replace(scaled["dynamics"], factors=(first, (taken, seen), last))
+    return scaled

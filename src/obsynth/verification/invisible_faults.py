@@ -118,11 +118,11 @@ def proved_least(
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                found = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level, enough)
+                bound = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level, enough)
             except ZeroDivisionError:  # a matrix is singular to these digits
                 continue
-        if found is not None:
-            return found
+        if bound is not None:
+            return bound
     return None
 
 
@@ -135,11 +135,11 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
         with flint.ctx.workprec(bits):
             try:
                 trajectories = _Trajectories(plant, [point], 0, setting._replace(delays=()), conjugates=False)
-                found = trajectories.bound(None)
+                bound = trajectories.bound(None)
             except ZeroDivisionError:
                 continue
-        if found is not None:
-            left = found * (1.0 - LIMIT_SHARE)
+        if bound is not None:
+            left = bound * (1.0 - LIMIT_SHARE)
             return left if LONGEST_DELAY * math.log(abs(point)) <= LIMIT_SHARE / 2.0 else None
     return None
 
@@ -205,10 +205,10 @@ class _Trajectories:
         (self.Bh, self.Dh), (self.Bw, self.Dw) = hidden_and_bounded(plant, setting)
         self.members: list[_Member] = []
         for point in _with_conjugates(points) if conjugates else points:
-            found = self._members(point)
+            new_members = self._members(point)
             # Two starts may lead to one zero.
-            known = any(one.point.overlaps(other.point) for one in found for other in self.members)
-            self.members += [] if known else found
+            known = any(one.point.overlaps(other.point) for one in new_members for other in self.members)
+            self.members += [] if known else new_members
 
     # The members: kernels of the pencil.
 
@@ -221,11 +221,11 @@ class _Trajectories:
         if free < 0:
             return []
         if not free:
-            found = _zero_near(still, moved, point)
-            if found is None:
+            zero = _zero_near(still, moved, point)
+            if zero is None:
                 return []
-            growing = found.point.abs_lower() > 1 if plant.is_discrete else found.point.real > 0
-            return [found] if growing else []
+            growing = zero.point.abs_lower() > 1 if plant.is_discrete else zero.point.real > 0
+            return [zero] if growing else []
         pivots, others = _pivots(still + point * moved)
         exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
         solved = _columns(exact, pivots).solve(-_columns(exact, others))
@@ -312,8 +312,8 @@ def worst_ratio(error: Any, noise: Any, level: float | None, enough: float | Non
         _scaled(_scaled(_columns(_rows(part, kept), kept), units).transpose(), units).transpose()
         for part in (error, noise)
     )
-    largest, found = _largest_ratio(error, noise)
-    roughly = _ratio(error, noise, _complex(found[:, None]))
+    largest, combination = _largest_ratio(error, noise)
+    roughly = _ratio(error, noise, _complex(combination[:, None]))
     if roughly is not None and enough is not None and roughly >= enough:
         return roughly
     closely = _ratio(error, noise, _worst_combination(error, noise, largest if level is None else level))
@@ -338,12 +338,12 @@ def _worst_combination(error: Any, noise: Any, level: float) -> Any:
     for i in range(count):
         shifted[i, i] -= flint.arb(REGULAR_SHARE) * (1 + square)
     step = _middle(shifted.inv()) * _middle(noise)
-    found = flint.acb_mat(count, 1, [1.0 + 0.37 * (i % 7) for i in range(count)])
+    vector = flint.acb_mat(count, 1, [1.0 + 0.37 * (i % 7) for i in range(count)])
     for _ in range(INVERSE_STEPS):
-        found = _middle(step * found)
-        largest = max(entry.abs_upper() for entry in found.entries())
-        found = _middle(found * (1 / flint.acb(largest)))
-    return found
+        vector = _middle(step * vector)
+        largest = max(entry.abs_upper() for entry in vector.entries())
+        vector = _middle(vector * (1 / flint.acb(largest)))
+    return vector
 
 
 def _largest_ratio(error: Any, noise: Any) -> tuple[float, Any]:
@@ -424,9 +424,9 @@ def exact_kernel(system: FloatArray) -> Any:
         entries += [top * (scale // bottom) for top, bottom in parts]
     basis, count = flint.fmpz_mat(rows, width, entries).nullspace()
     table = [[flint.acb(flint.arb(entry)) for entry in row[:count]] for row in basis.tolist()]
-    found = flint.acb_mat(width, count, [entry for row in table for entry in row])
+    kernel = flint.acb_mat(width, count, [entry for row in table for entry in row])
     sizes = [max(abs(row[j]).abs_upper() for row in table) for j in range(count)]
-    return _scaled(found, [1 / flint.acb(size.mid()) for size in sizes])
+    return _scaled(kernel, [1 / flint.acb(size.mid()) for size in sizes])
 
 
 def _scaled(matrix: Any, factors: Sequence[Any]) -> Any:
@@ -436,10 +436,10 @@ def _scaled(matrix: Any, factors: Sequence[Any]) -> Any:
 
 
 def _with_conjugates(points: Sequence[complex]) -> list[complex]:
-    found = []
+    both = []
     for point in points:
-        found += [complex(point)] if point.imag == 0.0 else [complex(point), complex(point).conjugate()]
-    return found
+        both += [complex(point)] if point.imag == 0.0 else [complex(point), complex(point).conjugate()]
+    return both
 
 
 def _pivots(matrix: Any) -> tuple[list[int], list[int]]:
@@ -462,11 +462,11 @@ def _columns(matrix: Any, columns: Sequence[int]) -> Any:
 
 def _placed(solved: Any, pivots: Sequence[int], others: Sequence[int], which: int) -> Any:
     """Return the solution in which one free entry is 1 and the other free ones are 0."""
-    found = _zeros(len(pivots) + len(others), 1)
-    found[others[which], 0] = 1
+    column = _zeros(len(pivots) + len(others), 1)
+    column[others[which], 0] = 1
     for row, place in enumerate(pivots):
-        found[place, 0] = solved[row, which]
-    return found
+        column[place, 0] = solved[row, which]
+    return column
 
 
 def _zero_near(still: FloatArray, moved: FloatArray, point: complex) -> _Member | None:
@@ -505,12 +505,12 @@ def _zero_near(still: FloatArray, moved: FloatArray, point: complex) -> _Member 
 def _weights(points: Sequence[Any], *, discrete: bool) -> Any:
     """Return the sums, or integrals, of ``conj(s_i^t) s_j^t`` over the past."""
     count = len(points)
-    found = _zeros(count, count)
+    weights = _zeros(count, count)
     for i, left in enumerate(points):
         for j, right in enumerate(points):
             rate = left.conjugate() * right - 1 if discrete else left.conjugate() + right
-            found[i, j] = 1 / rate
-    return found
+            weights[i, j] = 1 / rate
+    return weights
 
 
 def _weighted(part: Any, weights: Any) -> Any:
@@ -520,11 +520,11 @@ def _weighted(part: Any, weights: Any) -> Any:
 
 
 def _padded(matrix: Any, size: int) -> Any:
-    count, found = matrix.nrows(), _zeros(size, size)
+    count, padded = matrix.nrows(), _zeros(size, size)
     for i in range(count):
         for j in range(count):
-            found[i, j] = matrix[i, j]
-    return found
+            padded[i, j] = matrix[i, j]
+    return padded
 
 
 def _through(model: Model, faults: Any, points: Sequence[Any]) -> tuple[Any, Any]:
@@ -545,8 +545,8 @@ def _through(model: Model, faults: Any, points: Sequence[Any]) -> tuple[Any, Any
 def _recursion(model: Model, states: Any, faults: Sequence[Any]) -> list[Any]:
     """Return the outputs of a reference model, as rows on all coefficients, over the last samples."""
     a, b, c, d = (_complex(part + 0j) for part in model)
-    found = []
+    outputs = []
     for sample in faults:
-        found.append(c * states + d * sample)
+        outputs.append(c * states + d * sample)
         states = a * states + b * sample
-    return found
+    return outputs

@@ -111,8 +111,8 @@ class StoredErrors:
 
     def _by_all(self, observer: LinearObserver, chosen: np.ufunc, *, closely: bool = False) -> StoredErrors:
         bounds = self.bounds
-        found = proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer))
-        for i, contraction in enumerate(found):
+        contractions = proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer))
+        for i, contraction in enumerate(contractions):
             others = self.channel.errors_per_unit(observer, contraction, closely=closely and not i)
             known = (np.where(np.isfinite(other), other, np.nan) for other in others)
             bounds = tuple(chosen(one, other) for one, other in zip(bounds, known, strict=True))
@@ -127,9 +127,9 @@ def _bounds_of(_observer: LinearObserver) -> ByNumbers[StoredErrors | None]:
 def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None = None) -> Iterator[Check]:
     """Yield the rows on stored numbers; ``gamma`` is the gain from the disturbances that is claimed, if any."""
     plant, observer = design.linear
-    found = StoredErrors.of(model)
+    errors = StoredErrors.of(model)
     claimed = {name: design.certificate.matrices.get(name) for name in _ERROR_WITNESSES}
-    if found is None:
+    if errors is None:
         yield information(
             "stored numbers",
             "what rounding of the stored numbers adds to the errors: no bound was found",
@@ -142,11 +142,11 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
                 "stored numbers: states", "the claimed bounds are found again", np.nan, 0.0, source="stored numbers"
             )
         return
-    pairs = [(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, found.bounds, strict=True)]
+    pairs = [(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, errors.bounds, strict=True)]
     if any(told is not None and told.shape == bound.shape and np.any(bound > told) for bound, told in pairs):
-        found = found.least(observer)
+        errors = errors.least(observer)
     columns = (model.state_names, plant.input_names, plant.disturbance_names)
-    for kind, name, bound, labels in zip(_WITNESS_SIGNALS, _ERROR_WITNESSES, found.bounds, columns, strict=True):
+    for kind, name, bound, labels in zip(_WITNESS_SIGNALS, _ERROR_WITNESSES, errors.bounds, columns, strict=True):
         if bound.size:
             yield _per_unit(observer, kind, bound, claimed[name], labels)
         elif claimed[name] is not None:
@@ -273,8 +273,8 @@ class _Composite:
         frequencies = unit * np.geomspace(SLOWEST_CLAIMED, np.pi if discrete else 10.0, points)
         # The poles of the plant on the boundary or about it; scattered multiple ones have angles next to each other.
         near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
-        found = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
-        kept = [angle for i, angle in enumerate(found) if not i or angle - found[i - 1] > APART * unit]
+        sorted_angles = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
+        kept = [angle for i, angle in enumerate(sorted_angles) if not i or angle - sorted_angles[i - 1] > APART * unit]
         angles = np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
         if few:
             # On both sides of each angle, ever closer to it.

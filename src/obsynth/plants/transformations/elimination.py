@@ -90,11 +90,11 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
         if plant.nx > EXACT_ELIMINATION_UP_TO and (plant.is_sparse or _has_few_entries(plant)):
             return eliminated_by_sparsity(plant)
         arrays = plant.dense()
-        found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
-    if not found.dropped and not found.is_of_lower_index:
-        found = found.with_tolerances(ELIMINATED)
-    note_source(arrays, found.plant)
-    return found if arrays is plant else replace(found, source=plant)
+        transformation = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
+    if not transformation.dropped and not transformation.is_of_lower_index:
+        transformation = transformation.with_tolerances(ELIMINATED)
+    note_source(arrays, transformation.plant)
+    return transformation if arrays is plant else replace(transformation, source=plant)
 
 
 def _is_identity(e: Any) -> bool:
@@ -113,15 +113,15 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     """Leave out what acts on nothing, and solve the algebraic equations by a sparse factor."""
     active = active_variables(plant)
     part = active_part(plant, active)
-    found = reduced_by_sparsity(part)
-    if found is None:
+    elimination = reduced_by_sparsity(part)
+    if elimination is None:
         raise not_index_one(plant, active)
     return replace(
-        found,
+        elimination,
         source=plant,
-        description=_description(part, found.plant.nx, active.dropped),
+        description=_description(part, elimination.plant.nx, active.dropped),
         dropped=active.dropped,
-        notes=tuple(filter(None, (active.note(), *found.notes))),
+        notes=tuple(filter(None, (active.note(), *elimination.notes))),
     )
 
 
@@ -132,16 +132,16 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
     try:
         if not active.dropped:
             raise refusal
-        found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
+        elimination = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
     except PreconditionError as error:
         if error.condition == "dynamic states":
             # It did not help: what is wrong with the plant as written is what a user can mend.
             active, error = everything_active(plant), refusal
         raise not_index_one(plant, active, error) from None
     return replace(
-        found,
+        elimination,
         source=plant,
-        description=_description(part, found.plant.nx, active.dropped),
+        description=_description(part, elimination.plant.nx, active.dropped),
         dropped=active.dropped,
         notes=(active.note(),),
     )
@@ -199,10 +199,10 @@ def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
         try:
             return _without_idle_variables(plant, error)
         except PreconditionError as refusal:
-            found = reduced_index(plant) if refusal.condition == "index" else None
-            if found is None:
+            lowered = reduced_index(plant) if refusal.condition == "index" else None
+            if lowered is None:
                 raise
-            return found
+            return lowered
     return _eliminated_densely(plant, count)
 
 

@@ -59,11 +59,11 @@ class ExactElimination:
 
     def numbers(self, sizes: Mapping[str, FloatArray], *, own: bool) -> ExactNumbers:
         """Return those of the reduced plant, with the sizes of the terms in its coordinates; ``own``: these ones."""
-        found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
+        matrices: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
         kept = {name: sizes[name] for name in DECISIVE if name in sizes}
         known = all(np.all(np.isfinite(part)) for part in kept.values())
-        exact = {name: fractions_of(found[name]) for name in DECISIVE}
-        before = None if self.uncleaned is None else {"E": found["E"], **self.uncleaned}
+        exact = {name: fractions_of(matrices[name]) for name in DECISIVE}
+        before = None if self.uncleaned is None else {"E": matrices["E"], **self.uncleaned}
         return ExactNumbers(
             exact,
             own=own,
@@ -79,13 +79,13 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     if plant.nx > EXACT_ELIMINATION_UP_TO or plant.exact is not None:
         return None
     computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_EXACT_INPUTS, *_EXACT_DIRECT))
-    found = _eliminated(plant, clean=computed)
-    if found is None or not computed:
-        return found
+    elimination = _eliminated(plant, clean=computed)
+    if elimination is None or not computed:
+        return elimination
     before = _eliminated(plant, clean=False, sized=False)
-    if before is None or all(found.matrices[name] == before.matrices[name] for name in found.matrices):
-        return replace(found, computed=True)
-    return replace(found, computed=True, uncleaned=before.matrices)
+    if before is None or all(elimination.matrices[name] == before.matrices[name] for name in elimination.matrices):
+        return replace(elimination, computed=True)
+    return replace(elimination, computed=True, uncleaned=before.matrices)
 
 
 def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> ExactElimination | None:
@@ -188,8 +188,8 @@ def rounded_once(
 
 def _moved_sizes(sizes: Mapping[str, FloatArray], change: FloatArray, back: FloatArray) -> dict[str, FloatArray]:
     """Return sizes of terms in other coordinates of the states."""
-    found = {name: size @ back if name in ("A", "C") else size for name, size in sizes.items()}
-    return {name: change @ size if name in ("A", *_EXACT_INPUTS) else size for name, size in found.items()}
+    turned = {name: size @ back if name in ("A", "C") else size for name, size in sizes.items()}
+    return {name: change @ size if name in ("A", *_EXACT_INPUTS) else size for name, size in turned.items()}
 
 
 def _solved_exactly(matrix: fmpq_mat, right: fmpq_mat, inverse: FloatArray | None) -> fmpq_mat:
@@ -240,7 +240,7 @@ def _sampled_sizes(
     """Return the sizes of terms once sampled: what cancelled before goes through the integral of ``exp(A t)``."""
     transition, held = zero_order_hold(smooth.A, np.hstack([smooth.Bf, smooth.Bd, np.eye(smooth.nx)]), sample_time)
     faults, disturbances, integral = np.split(np.abs(held), [smooth.nf, smooth.nf + smooth.nd], axis=1)
-    found = dict(sizes)
+    sampled = dict(sizes)
     for name, own in (("A", np.abs(transition)), ("Bf", faults), ("Bd", disturbances)):
-        found[name] = own + integral @ (sizes[name] - np.abs(getattr(smooth, name)))
-    return found if all(np.all(np.isfinite(part)) for part in found.values()) else None
+        sampled[name] = own + integral @ (sizes[name] - np.abs(getattr(smooth, name)))
+    return sampled if all(np.all(np.isfinite(part)) for part in sampled.values()) else None

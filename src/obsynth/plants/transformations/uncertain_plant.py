@@ -133,13 +133,13 @@ def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
     ``sizes (m,)``: of the rows; what is below `ROW_ROUNDING_SHARE` of these is rounding."""
     n = columns.shape[1]
     acting = np.abs(columns) > ROW_ROUNDING_SHARE * np.maximum(sizes, np.finfo(np.float64).tiny)[:, None]
-    found = [j for j in range(n) if not acting[n:, j].any()]
+    untouched = [j for j in range(n) if not acting[n:, j].any()]
     while True:
-        others = [i for i in range(n) if i not in found]
-        kept = [j for j in found if not acting[others, j].any()]
-        if kept == found:
-            return found
-        found = kept
+        others = [i for i in range(n) if i not in untouched]
+        kept = [j for j in untouched if not acting[others, j].any()]
+        if kept == untouched:
+            return untouched
+        untouched = kept
 
 
 def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
@@ -163,20 +163,20 @@ def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     weights = moved[seen] / max(float(moved.max()), np.finfo(np.float64).tiny) + UNTOUCHED_SHARE
     pivots = seen[dgeqp3(basis[:, seen] * weights)[1][:rank] - 1]
     free = [j for j in seen.tolist() if j not in set(pivots.tolist())]
-    found = np.eye(n)
+    coordinates = np.eye(n)
     inside = np.round(np.linalg.solve(basis[:, pivots], basis[:, free]), COORDINATE_DIGITS)
-    found[np.ix_(pivots, free)] = -inside
-    return found
+    coordinates[np.ix_(pivots, free)] = -inside
+    return coordinates
 
 
 def _moved(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     """Return how much the constants move each state ``(n,)``: through its own equation, or those of others."""
     a, e = matrices["A"], matrices["E"]
-    found = np.abs(a.parts).sum(axis=(0, 2)) + np.abs(e.parts).sum(axis=(0, 2))
+    moved_sizes = np.abs(a.parts).sum(axis=(0, 2)) + np.abs(e.parts).sum(axis=(0, 2))
     size = np.abs(a.center) / max(float(np.abs(a.center).max(initial=0.0)), np.finfo(np.float64).tiny)
-    for _ in range(len(found)):
-        found = np.maximum(found, size @ found)
-    return np.asarray(found)
+    for _ in range(len(moved_sizes)):
+        moved_sizes = np.maximum(moved_sizes, size @ moved_sizes)
+    return np.asarray(moved_sizes)
 
 
 def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[str, ...]) -> dict[str, AffineMatrix]:
@@ -226,9 +226,9 @@ def reduced_matrices(
         "A": AffineMatrix.exact(np.zeros((nd, nd)), count),
         **{k: matrices[k] for k in (*_INPUT_MATRICES, *_DIRECT)},
     }
-    found = _split(top, like, ("A", *_INPUT_MATRICES))
+    reduced = _split(top, like, ("A", *_INPUT_MATRICES))
     read = _split(outputs, {**like, "C": like["A"]}, ("C", *_DIRECT))
-    return {"E": ahead, **found, **read}
+    return {"E": ahead, **reduced, **read}
 
 
 def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix, rounding: float) -> None:
@@ -241,8 +241,8 @@ def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix, rounding: floa
         "without one): which states are dynamic would change in the box. Multiply whole rows of E by a "
         "constant, or give E no tolerance there.",
     }
-    for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
-        size = np.abs(found.center) + found.spread + found.radius
+    for what, matrix, axis in (("row", rows, 1), ("state", columns, 0)):
+        size = np.abs(matrix.center) + matrix.spread + matrix.radius
         moving = size.any(axis=axis)
         if moving.any() and size.max() <= rounding:
             raise PreconditionError(

@@ -96,13 +96,13 @@ class AdaptiveBound:
         own, structure = len(self.structure.owner), self.structure
         sizes = np.abs(estimates @ structure.channel_rows[own:].T)
         single = structure.single - own
-        found = np.zeros((*estimates.shape[:-1], self.width))
-        found[..., own : structure.single] = sizes[..., :single]
+        channels = np.zeros((*estimates.shape[:-1], self.width))
+        channels[..., own : structure.single] = sizes[..., :single]
         if sizes.shape[-1] > single:
-            found[..., structure.single] = sizes[..., single:].max(axis=-1)
+            channels[..., structure.single] = sizes[..., single:].max(axis=-1)
         if self.remainder_inputs:
-            found[..., structure.channels :] = np.abs(inputs[..., list(self.remainder_inputs)])
-        return found
+            channels[..., structure.channels :] = np.abs(inputs[..., list(self.remainder_inputs)])
+        return channels
 
 
 class Start:
@@ -125,13 +125,13 @@ class Start:
     @property
     def size(self) -> FloatArray:
         """Upper bound of each component of eps."""
-        found = np.abs(self.center) + self.radius
-        return np.asarray(found if self.norm is None else found + self.norm)
+        size = np.abs(self.center) + self.radius
+        return np.asarray(size if self.norm is None else size + self.norm)
 
     def largest(self, left: FloatArray) -> FloatArray:
         """Return the largest size of each row of ``left eps``."""
-        found = np.abs(left @ self.center) + np.abs(left) @ self.radius
-        return np.asarray(found if self.norm is None else found + self.norm * np.linalg.norm(left, axis=-1))
+        size = np.abs(left @ self.center) + np.abs(left) @ self.radius
+        return np.asarray(size if self.norm is None else size + self.norm * np.linalg.norm(left, axis=-1))
 
 
 def adaptive_bound(
@@ -204,21 +204,21 @@ def _start_table(
     structure: ErrorStructure, responses: Responses, start: Start
 ) -> tuple[FloatArray, tuple[float, FloatArray]]:
     """Return what the start adds to channels and outputs, sample by sample, and what goes on decaying after that."""
-    both, power, found = (structure.channel_rows @ structure.Cx, structure.Co), np.eye(len(structure.Az)), []
+    both, power, table = (structure.channel_rows @ structure.Cx, structure.Co), np.eye(len(structure.Az)), []
     for _ in range(START_RINGS * responses.length):
         channels, outputs = (start.largest(left @ power) for left in both)
-        found.append(np.concatenate([structure.channel_sizes(channels), outputs]) * OUTWARD)
+        table.append(np.concatenate([structure.channel_sizes(channels), outputs]) * OUTWARD)
         power = structure.Az @ power
     # ``|Az^L| w <= theta w`` is proved.
     theta, weights = positive_vector(responses.tail_eps)
     if not len(weights):
-        return np.array(found), (0.0, np.zeros(len(found[0])))
+        return np.array(table), (0.0, np.zeros(len(table[0])))
     factor = float(np.max(start.size / weights)) * OUTWARD
     channels, outputs = (
         (np.abs(left @ responses.powers[:-1]) + power_rounding(left, responses.powers)).max(axis=0) @ weights
         for left in both
     )
-    return np.array(found), (theta, np.concatenate([structure.channel_sizes(channels), outputs]) * factor)
+    return np.array(table), (theta, np.concatenate([structure.channel_sizes(channels), outputs]) * factor)
 
 
 def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = True) -> FloatArray:
@@ -226,13 +226,13 @@ def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = 
     given, (inner, state, outputs) = structure.disturbances, structure.rows
 
     def total(left: FloatArray, direct: AffineMatrix) -> FloatArray:
-        found = responses.gain(left, given.center[inner], direct.center) * float(center)
+        gains = responses.gain(left, given.center[inner], direct.center) * float(center)
         for part, at_once in zip(given.parts, direct.parts, strict=True):
             if part.any():
-                found = found + responses.gain(left, part[inner], at_once)
+                gains = gains + responses.gain(left, part[inner], at_once)
         if given.radius.any():
-            found = found + responses.absolute_gain(left, given.radius[inner]) + direct.radius
-        return np.asarray(found @ structure.bounds * OUTWARD)
+            gains = gains + responses.absolute_gain(left, given.radius[inner]) + direct.radius
+        return np.asarray(gains @ structure.bounds * OUTWARD)
 
     rows = structure.channel_rows
     channels = total(rows @ structure.Cx, given[state, :].after(rows))
@@ -262,7 +262,7 @@ def _rounding(
 
     reading = absolute(rows) @ absolute(structure.reading)
     channels = spread(rows @ structure.Cx, reading @ read, pushed)
-    found = spread(structure.Co, picked @ read, pushed)
+    output_rounding = spread(structure.Co, picked @ read, pushed)
     order = [*range(nu + ny, nu + ny + n), *range(nu)]
     for part, known in zip(structure.state.parts, structure.inputs.parts, strict=True):
         both = np.hstack([part, known])
@@ -270,7 +270,7 @@ def _rounding(
         into = absolute(structure.Az) @ largest_psi + absolute(both[inner])
         for left, direct, total in (
             (rows @ structure.Cx, absolute(rows) @ absolute(both[at_state]), channels),
-            (structure.Co, absolute(both[outputs]), found),
+            (structure.Co, absolute(both[outputs]), output_rounding),
         ):
             total[:, order] += spread(left, direct + absolute(left) @ largest_psi, into)
-    return np.vstack([structure.channel_sizes(channels), found]) * OUTWARD
+    return np.vstack([structure.channel_sizes(channels), output_rounding]) * OUTWARD
