@@ -120,7 +120,16 @@ def test_texts_and_picture(bicycle: obsynth.Comparison) -> None:
     ]
     assert np.ptp(noisier.get_ylim()) > 2.0 * np.ptp(scenario.get_ylim())
     assert 'content="obsynth compare"' in bicycle.page()
-    json.dumps(bicycle.to_dict())
+    plain = json.loads(json.dumps(bicycle.to_dict()))
+    header, first = bicycle.rows()[0], bicycle.rows()[1]
+    assert [*plain["rows"][0]] == [*header]
+    # Numbers are numbers, and each row names its method.
+    assert {type(value) for row in plain["rows"] for name, value in row.items() if name not in header[:2]} <= {
+        int,
+        float,
+    }
+    assert all(row["method"] for row in plain["rows"])
+    assert f"{plain['rows'][0]['deviation']:.3g}" == first[header.index("deviation")]
 
 
 @pytest.mark.long

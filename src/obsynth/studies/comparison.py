@@ -74,6 +74,8 @@ _HEADER = (
     "noise / least",
     "ms",
 )
+#: Where the bound stands among the numbers between order and time, and the shares of the least possible.
+_BOUND_COLUMN, _SHARE_COLUMNS = _HEADER.index("bound") - 3, slice(-2, None)
 #: A gain of at most this is zero but for rounding, and is shown as zero.
 ROUNDED_GAIN = 1e-9
 
@@ -264,32 +266,15 @@ class Comparison:
         rows = []
         for entry in self.methods:
             for k, fault in enumerate(entry.faults):
-                figures = fault.figures
-                numbers = (
-                    figures.half,
-                    figures.most,
-                    figures.at_horizon,
-                    figures.peak,
-                    figures.deviation,
-                    0.0 if figures.unknown_input_gain <= ROUNDED_GAIN else figures.unknown_input_gain,
-                    fault.bias,
-                    fault.detection_delay,
-                    fault.smallest_found,
-                )
-                beside = (fault.bound / fault.least if fault.least > 0.0 else np.nan, fault.rms)
-                bound = upper_number(fault.bound) if np.isfinite(fault.bound) else _number(fault.bound)
-                rows.append(
-                    (
-                        entry.method if k == 0 else "",
-                        figures.fault,
-                        str(entry.order) if k == 0 else "",
-                        *(_number(value) for value in numbers),
-                        bound,
-                        *(_number(value) for value in beside),
-                        *(_number(share) if k == 0 else "" for share in entry.shares),
-                        f"{entry.milliseconds:.0f}" if k == 0 else "",
-                    )
-                )
+                order, *figures, milliseconds = _figures(entry, fault)
+                texts = [_number(value) for value in figures]
+                if np.isfinite(fault.bound):
+                    texts[_BOUND_COLUMN] = upper_number(fault.bound)
+                if k:
+                    # What is of the method stands in its first row.
+                    texts[_SHARE_COLUMNS] = ["", ""]
+                own = (str(order), f"{milliseconds:.0f}") if k == 0 else ("", "")
+                rows.append((entry.method if k == 0 else "", fault.figures.fault, own[0], *texts, own[1]))
         return (_HEADER, *rows)
 
     @property
@@ -325,7 +310,6 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data."""
-        header, *rows = self.rows()
         return {
             "recommended": self.recommended,
             "reason": self.reason,
@@ -334,7 +318,11 @@ class Comparison:
             "notes": list(self.notes),
             "beside_the_least": list(self.beside_the_least),
             "refusals": list(self.refusals),
-            "rows": [dict(zip(header, row, strict=True)) for row in rows],
+            "rows": [
+                dict(zip(_HEADER, (entry.method, fault.figures.fault, *_figures(entry, fault)), strict=True))
+                for entry in self.methods
+                for fault in entry.faults
+            ],
             "methods": [{"method": name, **entry} for name, entry in self.claims()["methods"].items()],
         }
 
@@ -525,6 +513,28 @@ def _reach(values: FloatArray) -> float:
     """Return how far nearly all values of a signal reach from zero; 0 where none is known."""
     known = np.abs(values[np.isfinite(values)])
     return float(np.quantile(known, SHOWN_SAMPLES)) if known.size else 0.0
+
+
+def _figures(entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]:
+    """Return the numbers of a row, in the order of the header after method and fault."""
+    figures = fault.figures
+    return (
+        entry.order,
+        figures.half,
+        figures.most,
+        figures.at_horizon,
+        figures.peak,
+        figures.deviation,
+        0.0 if figures.unknown_input_gain <= ROUNDED_GAIN else figures.unknown_input_gain,
+        fault.bias,
+        fault.detection_delay,
+        fault.smallest_found,
+        fault.bound,
+        fault.bound / fault.least if fault.least > 0.0 else np.nan,
+        fault.rms,
+        *entry.shares,
+        entry.milliseconds,
+    )
 
 
 def _number(value: float) -> str:
