@@ -183,7 +183,7 @@ def _next_to(
     step = solved_by_lifting(entries, [missing[i] for i in rows])
     if step is None:
         return None
-    found = [Fraction(float(value)) for value in values]
+    fractions = [Fraction(float(value)) for value in values]
     added = dict(zip(columns, step, strict=True))
     kept = set(rows)
     sums = [Fraction(0)] * len(matrix)
@@ -193,8 +193,8 @@ def _next_to(
     if any(sums[i] != missing[i] for i in range(len(matrix)) if i not in kept):
         return None
     for column, value in added.items():
-        found[column] += value
-    return found
+        fractions[column] += value
+    return fractions
 
 
 def _exact_entries(window: Window) -> Iterator[tuple[int, int, Fraction]]:
@@ -206,20 +206,20 @@ def _exact_entries(window: Window) -> Iterator[tuple[int, int, Fraction]]:
 def _entries(window: Window, told: list[int], *, columns: bool) -> dict[tuple[int, int], Fraction]:
     """Return exact entries: of some columns, transposed, or of some rows."""
     place = {number: k for k, number in enumerate(told)}
-    found: dict[tuple[int, int], Fraction] = {}
+    entries: dict[tuple[int, int], Fraction] = {}
     for i, j, entry in _exact_entries(window):
         key = (place.get(j), i) if columns else (place.get(i), j)
         if key[0] is not None:
-            found[key[0], key[1]] = found.get((key[0], key[1]), Fraction(0)) + entry
-    return found
+            entries[key[0], key[1]] = entries.get((key[0], key[1]), Fraction(0)) + entry
+    return entries
 
 
 def _transposed_product(window: Window, multipliers: list[Fraction]) -> list[Fraction]:
-    found = [Fraction(0)] * len(window.bar)
+    product = [Fraction(0)] * len(window.bar)
     for i, j, entry in _exact_entries(window):
         if multipliers[i]:
-            found[j] += entry * multipliers[i]
-    return found
+            product[j] += entry * multipliers[i]
+    return product
 
 
 def _largest(window: Window, parts: list[Fraction]) -> Fraction:
@@ -256,8 +256,8 @@ def _rounding(whole: ObserverDesign, window: Window, multipliers: list[Fraction]
     state, (az, bu, by) = Dyadic.of(observer.Cz[[row]]), (Dyadic.of(m) for m in (observer.Az, observer.Bu, observer.By))
     missed = [Fraction(0)] * (plant.nu + plant.ny)
     for k in range(exact.last, -1, -1):
-        found = [part.fraction(0, j) for part in response for j in range(part.shape[1])]
-        missed = [m + abs(a - b) for m, a, b in zip(missed, exact.at(k), found, strict=True)]
+        entries = [part.fraction(0, j) for part in response for j in range(part.shape[1])]
+        missed = [m + abs(a - b) for m, a, b in zip(missed, exact.at(k), entries, strict=True)]
         response, state = [state @ bu, state @ by], state @ az
     constant = -sum((m * side for m, side in zip(multipliers, window.standing or (), strict=False)), start=Fraction(0))
     away = rounded_outward(abs(Fraction(float(observer.added[row])) - constant))

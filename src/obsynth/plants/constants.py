@@ -237,8 +237,8 @@ class ConstantsBox:
         """
         names = self.names
         each = dict(zip(names, np.broadcast_to(factors, (len(names),)).tolist(), strict=True))
-        found = {name: item.scaled(each.get(name, 1.0)) for name, item in self.constants.items()}
-        return replace(self, constants=found)
+        scaled_constants = {name: item.scaled(each.get(name, 1.0)) for name, item in self.constants.items()}
+        return replace(self, constants=scaled_constants)
 
     def part(self, lower: FloatArray, upper: FloatArray) -> ConstantsBox:
         """Return the part ``lower <= q <= upper`` of the box; its nominal values are in its middle.
@@ -248,11 +248,11 @@ class ConstantsBox:
         lower, upper : FloatArray
             One for each uncertain constant, in -1 .. 1.
         """
-        found = dict(self.constants)
+        constants = dict(self.constants)
         for item, a, b in zip(self.uncertain, lower, upper, strict=True):
             low, high = item.middle + float(a) * item.half, item.middle + float(b) * item.half
-            found[item.name] = Constant(item.name, min(max((low + high) / 2.0, low), high), low, high, item.unit)
-        return replace(self, constants=found)
+            constants[item.name] = Constant(item.name, min(max((low + high) / 2.0, low), high), low, high, item.unit)
+        return replace(self, constants=constants)
 
     def values(self, q: FloatArray) -> dict[str, float]:
         """Return the value of each constant at ``q (p,)`` in -1 .. 1.
@@ -262,10 +262,10 @@ class ConstantsBox:
         q : FloatArray
             One for each uncertain constant.
         """
-        found = {name: item.nominal for name, item in self.constants.items()}
+        values = {name: item.nominal for name, item in self.constants.items()}
         for item, place in zip(self.uncertain, q, strict=True):
-            found[item.name] = item.middle + float(place) * item.half
-        return found
+            values[item.name] = item.middle + float(place) * item.half
+        return values
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `constants_box` reads it."""
@@ -283,10 +283,10 @@ class ConstantsBox:
 def tolerance_share(value: Any, path: str) -> float:
     """Return a tolerance as a share, from ``"5 %"`` or a share such as 0.05."""
     if isinstance(value, str):
-        found = _PER_CENT.fullmatch(value)
-        if found is None:
+        match = _PER_CENT.fullmatch(value)
+        if match is None:
             raise SpecError(f"The tolerance {value!r} is no per cent: write it as '5 %'.", path=path)
-        return float(found.group(1)) / 100.0
+        return float(match.group(1)) / 100.0
     if not (is_finite_number(value) and value >= 0.0):
         raise SpecError(f"The tolerance is {value!r}: write it as '5 %' (a box needs both ends).", path=path)
     if value >= 1.0:
@@ -368,11 +368,11 @@ def constants_box(
     if not isinstance(given, Mapping):
         raise SpecError(f"constants is {given!r}: give a mapping from names to tolerances.", path="constants")
     before = known or {}
-    found = dict(before)
+    constants = dict(before)
     for name, value in given.items():
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
-        found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
+        constants[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
     more = {
         "variation": variation,
         "source": source,
@@ -381,4 +381,4 @@ def constants_box(
         "calibrated": calibrated,
         "calibration": calibration,
     }
-    return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]
+    return ConstantsBox(constants, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

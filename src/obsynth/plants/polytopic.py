@@ -104,16 +104,16 @@ class PolytopicSystem:
         if vertices is not None:
             if constants:
                 raise SpecError("constants are for plant, whose entries may be expressions.", path="constants")
-            found, held = _from_vertices(vertices, scheduling)
-            given = {"vertices": [vertex.as_dict() for vertex in found], "scheduling": _plain(scheduling)}
+            dense_vertices, held = _from_vertices(vertices, scheduling)
+            given = {"vertices": [vertex.as_dict() for vertex in dense_vertices], "scheduling": _plain(scheduling)}
         else:
             numbers = _constants(constants)
-            found, held = _from_expressions(plant or {}, scheduling, numbers)
+            dense_vertices, held = _from_expressions(plant or {}, scheduling, numbers)
             given = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
-        if shift is not None and shift not in found[0].input_names:
+        if shift is not None and shift not in dense_vertices[0].input_names:
             raise SpecError(f"shift is {shown(shift)}, which is no input of the plant.", path="shift")
         given |= {} if shift is None else {"shift": shift}
-        for name, value in (("vertices", found), ("scheduling", held), ("shift", shift), ("_given", given)):
+        for name, value in (("vertices", dense_vertices), ("scheduling", held), ("shift", shift), ("_given", given)):
             object.__setattr__(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -237,9 +237,9 @@ def _from_vertices(
     for place, vertex in enumerate(vertices):
         if not isinstance(vertex, DescriptorSystem):
             raise SpecError(f"Vertex {place + 1} is {a_kind(vertex)}: give a DescriptorSystem.", path="vertices")
-    found = tuple(vertex.dense() for vertex in vertices)
-    first = found[0]
-    for place, vertex in enumerate(found[1:], start=2):
+    dense = tuple(vertex.dense() for vertex in vertices)
+    first = dense[0]
+    for place, vertex in enumerate(dense[1:], start=2):
         if vertex.uncertainty is not None or first.uncertainty is not None:
             raise SpecError(
                 "A vertex has constants with tolerances, which no proof over a region takes in yet: leave them out "
@@ -260,17 +260,17 @@ def _from_vertices(
                 condition="constant E",
             )
     if scheduling is None:
-        count = len(found)
+        count = len(dense)
         names = tuple(f"weight{i + 1}" for i in range(count))
-        return found, Scheduling(names, np.zeros(count), np.ones(count), (None,) * count, ())
+        return dense, Scheduling(names, np.zeros(count), np.ones(count), (None,) * count, ())
     asked = parameters_of(scheduling)
-    if len(found) != 2 or len(asked) != 1:
+    if len(dense) != 2 or len(asked) != 1:
         raise SpecError(
             "scheduling beside vertices is one parameter of two vertices; the parameters of more are their weights "
             "(leave scheduling out), or give plant with expressions.",
             path="scheduling",
         )
-    return found, _scheduling(asked, tuple(asked))
+    return dense, _scheduling(asked, tuple(asked))
 
 
 def _scheduling(asked: Mapping[str, Mapping[str, Any]], functions: Sequence[str]) -> Scheduling:
@@ -286,11 +286,11 @@ def _scheduling(asked: Mapping[str, Mapping[str, Any]], functions: Sequence[str]
 
 
 def _constants(given: Mapping[str, float] | None) -> dict[str, float]:
-    found = dict(given or {})
-    for name, value in found.items():
+    constants = dict(given or {})
+    for name, value in constants.items():
         if not is_finite_number(value):
             raise SpecError(f"The constant {name!r} is {shown(value)}: give a finite number.", path=f"constants.{name}")
-    return {str(name): float(value) for name, value in found.items()}
+    return {str(name): float(value) for name, value in constants.items()}
 
 
 def _from_expressions(

@@ -58,10 +58,10 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
     given = _given_gain(terms, asked.gains)
     progress("solving the inequalities at the corners of the slopes")
     problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
-    found = problem.solved(asked, given, solver)
+    solution = problem.solved(asked, given, solver)
     progress("proving the shipped numbers")
-    claims, matrices = _proved(terms, slopes, bounds, drive, found, asked, problem)
-    gain = found.gain
+    claims, matrices = _proved(terms, slopes, bounds, drive, solution, asked, problem)
+    gain = solution.gain
     start = named_vector(asked.initial_state, (*plant.state_names, *faults), _nominal(plant, faults), "initial_state")
     places = [(*plant.state_names, *faults).index(name) for name in terms.names]
     observer = RegionObserver(
@@ -79,15 +79,15 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
         {"L": gain},
         observer,
         Certificate(matrices, claims),
-        {"engine": "lmi", "runs": found.runs},
+        {"engine": "lmi", "runs": solution.runs},
         tuple(_notes(region, observer, asked)),
     )
 
 
 def _stored_bounds(slopes: tuple[Slope, ...]) -> FloatArray:
-    found = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
-    room = SLOPE_ROOM * np.abs(found).max(axis=1, initial=0.0, keepdims=True)
-    return np.asarray(found + room * np.array([[-1.0, 1.0]]))
+    ends = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
+    room = SLOPE_ROOM * np.abs(ends).max(axis=1, initial=0.0, keepdims=True)
+    return np.asarray(ends + room * np.array([[-1.0, 1.0]]))
 
 
 def _drive(
@@ -102,11 +102,11 @@ def _drive(
 def _given_gain(terms: NonlinearTerms, gains: Any) -> FloatArray | None:
     if gains is None:
         return None
-    found, shape = as_matrix(gains, "gains"), (terms.differential, len(terms.output_names))
-    if found.shape != shape:
+    gain, shape = as_matrix(gains, "gains"), (terms.differential, len(terms.output_names))
+    if gain.shape != shape:
         moving = ", ".join(terms.names[: terms.differential])
-        raise SpecError(f"gains are {found.shape}: give {shape}, the rows those of {moving}.", path="gains")
-    return found
+        raise SpecError(f"gains are {gain.shape}: give {shape}, the rows those of {moving}.", path="gains")
+    return gain
 
 
 def _nominal(plant: DAEModel, faults: tuple[str, ...]) -> FloatArray:
@@ -240,20 +240,20 @@ def _errors_of_kalman(
         scaled = a * s / s[:, None]
         covariance = continuous_solution(scaled, c * s, drive @ drive.T + least @ least, D @ D.T)
         if covariance is not None and is_positive(covariance):
-            found = s * np.sqrt(np.diag(covariance))
-            return np.concatenate([found, np.maximum(np.abs(below) @ found, LEAST_DRIVE * sizes[k:])])
+            deviations = s * np.sqrt(np.diag(covariance))
+            return np.concatenate([deviations, np.maximum(np.abs(below) @ deviations, LEAST_DRIVE * sizes[k:])])
     return sizes
 
 
 def _sizes(terms: NonlinearTerms, region: OperatingRegion) -> FloatArray:
     """Return what each state and fault is about: the width of its range, or of those that it has a part in."""
-    found = np.zeros(len(terms.names))
+    sizes = np.zeros(len(terms.names))
     for each in region.ranges:
         for name, factor in each.combination.parts:
             if name in terms.names:
                 place = terms.names.index(name)
-                found[place] = max(found[place], (each.high - each.low) / abs(float(factor)))
-    return np.where(found > 0.0, found, 1.0)
+                sizes[place] = max(sizes[place], (each.high - each.low) / abs(float(factor)))
+    return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def _powers(values: FloatArray) -> FloatArray:
@@ -312,19 +312,19 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
     seen = {place for place, _, _ in region.measured()}
     states, _, _ = region.matrices()
     assumed = [each.text for place, each in enumerate(region.ranges) if place not in seen and bool(states[place].any())]
-    found = [
+    notes = [
         f"One certificate at {2 ** len(observer.slopes)} corners of {len(observer.slopes)} slopes, for the region "
         f"{region.sentence()}. A row in which an input, a measurement or an estimate leaves it is out: nothing is "
         f"claimed for {observer.forgetting} rows from the last such row on."
     ]
     if assumed:
-        found.append(
+        notes.append(
             f"That {', '.join(assumed)} of the plant stay in their ranges is seen by the estimates alone: until these "
             "have settled it is an assumption."
         )
-    found.append(
+    notes.append(
         "The observer takes steps of implicit Euler, for which the same certificate is proved; what such a step misses "
         "of the plant's own motion acts as a disturbance. Samples that are close beside the plant's time constants "
         "keep it small."
     )
-    return found
+    return notes

@@ -222,8 +222,10 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
     if variable is None and ("A" in content or (not structs and "a" in content)):
         return _as_matlab_names(content)
     if variable is None and len(structs) != 1:
-        found = ", ".join(map(repr, structs)) or "none"
-        raise SpecError(f"{source}: name the struct of the plant (variable=...); it has: {found}.", path=str(source))
+        named_structs = ", ".join(map(repr, structs)) or "none"
+        raise SpecError(
+            f"{source}: name the struct of the plant (variable=...); it has: {named_structs}.", path=str(source)
+        )
     name = structs[0] if variable is None else variable
     if name not in structs:
         raise SpecError(
@@ -237,12 +239,12 @@ def _as_matlab_names(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return fields by the names that MATLAB has: Octave's are in lower case, and some in a struct of their own."""
     if "A" in fields or "a" not in fields:
         return dict(fields)
-    found = {_OCTAVE_NAMES.get(name, name): value for name, value in fields.items()}
-    inner = found.pop("lti", None)
+    renamed = {_OCTAVE_NAMES.get(name, name): value for name, value in fields.items()}
+    inner = renamed.pop("lti", None)
     if getattr(getattr(inner, "dtype", None), "names", None) and inner.size == 1:
         record = inner.reshape(-1)[0]
-        found |= {_OCTAVE_NAMES.get(name, name): record[name] for name in inner.dtype.names}
-    return found
+        renamed |= {_OCTAVE_NAMES.get(name, name): record[name] for name in inner.dtype.names}
+    return renamed
 
 
 def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: bool) -> None:
@@ -326,13 +328,13 @@ def _nonempty(value: Any) -> Any:
 
 def _seconds_of_unit(fields: Mapping[str, Any], source: Path) -> float:
     """Return how many seconds are in the unit of time of a file; one where it states none."""
-    found = _texts(fields["TimeUnit"]) if "TimeUnit" in fields else None
-    if found is None:
+    units = _texts(fields["TimeUnit"]) if "TimeUnit" in fields else None
+    if units is None:
         return 1.0
-    text = found[0].lower()
-    if len(found) != 1 or text not in _SECONDS_OF_TIME_UNITS:
+    text = units[0].lower()
+    if len(units) != 1 or text not in _SECONDS_OF_TIME_UNITS:
         raise SpecError(
-            f"{source}: TimeUnit is {found[0]!r}; known are: {', '.join(_SECONDS_OF_TIME_UNITS)}.", path=str(source)
+            f"{source}: TimeUnit is {units[0]!r}; known are: {', '.join(_SECONDS_OF_TIME_UNITS)}.", path=str(source)
         )
     return _SECONDS_OF_TIME_UNITS[text]
 
@@ -426,7 +428,7 @@ def _delays(
 ) -> dict[str, float]:
     """Return delays in s by input or output; ``unit``: seconds in what the file counts them in, samples or TimeUnit."""
     sizes = _signal_counts(given)
-    found: dict[str, float] = {}
+    delays: dict[str, float] = {}
     for (field, kind), prefix in zip(_DELAYS_OF.items(), "uy", strict=True):
         values = np.ravel(_numbers_in(fields[field])) if field in fields else np.zeros(0)
         if not np.any(values):
@@ -438,8 +440,8 @@ def _delays(
             )
         names = labels[kind] or [f"{prefix}{i + 1}" for i in range(sizes[kind])]
         for name, value in zip(names, np.broadcast_to(values, sizes[kind]), strict=True):
-            found[name] = float(value) * unit
-    return found
+            delays[name] = float(value) * unit
+    return delays
 
 
 def _in(variable: str | None) -> str:
@@ -508,11 +510,11 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
         raise SpecError(f"{source} cannot be read: {os.strerror(errno.ENOENT)}.", path=str(source))
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", read_text(source), flags=re.DOTALL)
     sizes = {name: int(count) for name, count in _SIZE.findall(text)}
-    found = {name: body for name, body in _MODELICA_MATRIX.findall(text)}
+    bodies = {name: body for name, body in _MODELICA_MATRIX.findall(text)}
     if "m" not in sizes and "p" not in sizes:
         # Older versions call them so.
         sizes |= {new: sizes[old] for new, old in (("m", "k"), ("p", "l")) if old in sizes}
-    missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in found]
+    missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in bodies]
     if missing:
         raise SpecError(
             f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.", path=str(source)
@@ -520,7 +522,7 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     _require_plain_model(text, source)
     shapes = {"A": ("n", "n"), "B": ("n", "m"), "C": ("p", "n"), "D": ("p", "m")}
     matrices = {
-        name: _matrix(found[name], sizes[rows], sizes[columns], name, source)
+        name: _matrix(bodies[name], sizes[rows], sizes[columns], name, source)
         for name, (rows, columns) in shapes.items()
     }
     names = {kind: [f"{kind}{i + 1}" for i in range(sizes[size])] for kind, size in zip("xuy", "nmp", strict=True)}

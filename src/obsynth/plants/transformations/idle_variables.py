@@ -186,21 +186,21 @@ def _idle(
     unknown[block_of_row[moving.row[~differentiated[moving.col]]]] = True
     unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~seen)] = True
     unknown = _spread(unknown & ~seen, from_block, to_block, within=~seen) & ~seen
-    found = np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
+    idle = np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
     nothing = np.zeros(0, dtype=np.int64)
-    return found if _solvable(plant, rows[found[0]], columns[found[1]]) else (nothing, nothing)
+    return idle if _solvable(plant, rows[idle[0]], columns[idle[1]]) else (nothing, nothing)
 
 
 def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None) -> Any:
     """Mark every target of a link whose source is marked, until nothing changes."""
-    found = marked.copy()
+    spread = marked.copy()
     while True:
-        more = found.copy()
-        more[target[found[source]]] = True
+        more = spread.copy()
+        more[target[spread[source]]] = True
         more &= True if within is None else within
-        if np.array_equal(more, found):
-            return found
-        found = more
+        if np.array_equal(more, spread):
+            return spread
+        spread = more
 
 
 def _undetermined_blocks(

@@ -126,11 +126,11 @@ def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> tuple[FloatArr
     levels = halvings(smooth.A, smooth.Bd, dt, pieces=pieces, times=MOST_RESTING_TIMES)
     shares = 2.0 ** -np.array(levels, dtype=np.float64)
     moves = {share: exponential(whole, dt * share).midpoint for share in set(shares.tolist())}
-    found, later = [], np.eye(n)
+    columns, later = [], np.eye(n)
     for share in shares.tolist():
-        found.append(later @ moves[share][:n, n:])
+        columns.append(later @ moves[share][:n, n:])
         later = later @ moves[share][:n, :n]
-    return np.hstack(found), shares
+    return np.hstack(columns), shares
 
 
 def with_moving_disturbances(affine: AffinePlant) -> AffinePlant:
@@ -160,12 +160,12 @@ def with_moving_disturbances(affine: AffinePlant) -> AffinePlant:
         # Constants of the sampled plant act from sample to sample; in between it is the nominal one.
         basis = np.eye(plant.nx)
         a, bd = AffineMatrix.exact(smooth.A, affine.count), AffineMatrix.exact(smooth.Bd, affine.count)
-    found = interval_columns(a, bd, plant.dt)
+    columns = interval_columns(a, bd, plant.dt)
     zero = AffineMatrix.exact(np.zeros((plant.nx, plant.nd)), affine.count)
-    matrix = all_columns(found, basis)
+    matrix = all_columns(columns, basis)
     blind = AffineMatrix.exact(np.zeros((plant.ny, matrix.shape[1])), affine.count)
     moved = {"Bd": affine_block([[matrix, zero]]), "Dd": affine_block([[blind, affine.Dd]])}
-    return replace(affine, matrices={**affine.matrices, **moved}, blocks=len(found.blocks), rest=found.rest)
+    return replace(affine, matrices={**affine.matrices, **moved}, blocks=len(columns.blocks), rest=columns.rest)
 
 
 def all_columns(found: IntervalColumns, basis: FloatArray) -> AffineMatrix:

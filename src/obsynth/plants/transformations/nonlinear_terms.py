@@ -182,10 +182,10 @@ class _Form:
 
     def plus(self, other: _Form, sign: int) -> _Form:
         def joined(one: dict[str, Fraction], two: dict[str, Fraction]) -> dict[str, Fraction]:
-            found = dict(one)
+            total = dict(one)
             for name, factor in two.items():
-                found[name] = found.get(name, Fraction(0)) + sign * factor
-            return {name: factor for name, factor in found.items() if factor}
+                total[name] = total.get(name, Fraction(0)) + sign * factor
+            return {name: factor for name, factor in total.items() if factor}
 
         return _Form(
             self.constant + sign * other.constant, joined(self.linear, other.linear), joined(self.terms, other.terms)
@@ -214,8 +214,8 @@ class _Registry:
         unknown = sorted(expression.names - set(known))
         if unknown:
             raise SpecError(f"{path}: {expression.text!r} uses {unknown[0]!r}, which is not known.", path=path)
-        found = expression.translated(known, self._operation)
-        return found if isinstance(found, _Form) else _Form.number(found)
+        translated = expression.translated(known, self._operation)
+        return translated if isinstance(translated, _Form) else _Form.number(translated)
 
     def _operation(self, operation: Callable[..., Any]) -> Callable[..., Any]:
         def done(*given: Any) -> _Form:
@@ -321,8 +321,8 @@ def _assembled(
     placed = [form.times(Fraction(-1)) for form in placed]
 
     def matrix(forms: Sequence[_Form], columns: Sequence[str], kind: str) -> FloatArray:
-        found = np.array([[float(getattr(form, kind).get(name, Fraction(0))) for name in columns] for form in forms])
-        return found.reshape(len(forms), len(columns))
+        entries = np.array([[float(getattr(form, kind).get(name, Fraction(0))) for name in columns] for form in forms])
+        return entries.reshape(len(forms), len(columns))
 
     def constants(forms: Sequence[_Form]) -> FloatArray:
         return np.array([float(form.constant) for form in forms])
@@ -356,11 +356,11 @@ def _assembled(
 
 def _in_order(solved: Sequence[_Form], seen: Sequence[_Form]) -> Callable[[str], int]:
     """Return the order in which nonlinearities occur."""
-    found: dict[str, int] = {}
+    order: dict[str, int] = {}
     for form in (*solved, *seen):
         for text in form.terms:
-            found.setdefault(text, len(found))
-    return found.__getitem__
+            order.setdefault(text, len(order))
+    return order.__getitem__
 
 
 def _solved_for_rates(

@@ -66,23 +66,23 @@ def bounded_model(
             condition="remainder",
         )
     equations, outputs = _remainders(model, linear, signals, middles, halves, given or {})
-    found = discretise(linear, sample_time).plant
-    if any(name.startswith("xi ") for name in found.state_names):
+    sampled = discretise(linear, sample_time).plant
+    if any(name.startswith("xi ") for name in sampled.state_names):
         raise PreconditionError(
             "The equations hold derivatives of algebraic states, so that the dynamic states are combinations of "
             "states: write the equations with derivatives of the dynamic states alone.",
             condition="remainder",
         )
     at = np.maximum(np.abs(middles - halves), np.abs(middles + halves))
-    own = found if shipped is None else shipped
+    own = sampled if shipped is None else shipped
     bounds = _sampled(linear, own, sample_time, (equations, outputs), dict(zip(signals, at.tolist(), strict=True)))
     if shipped is not None:
         return shipped, bounds
-    nx, ny = found.nx, found.ny
-    with_remainders = found.replace(
-        Bd=np.hstack([found.Bd, np.eye(nx), np.zeros((nx, ny))]),
-        Dd=np.hstack([found.Dd, np.zeros((ny, nx)), np.eye(ny)]),
-        disturbance_names=[*found.disturbance_names, *remainder_names(found)],
+    nx, ny = sampled.nx, sampled.ny
+    with_remainders = sampled.replace(
+        Bd=np.hstack([sampled.Bd, np.eye(nx), np.zeros((nx, ny))]),
+        Dd=np.hstack([sampled.Dd, np.zeros((ny, nx)), np.eye(ny)]),
+        disturbance_names=[*sampled.disturbance_names, *remainder_names(sampled)],
     )
     return with_remainders, bounds
 
@@ -228,8 +228,8 @@ def _sampled(
     seen = _away(reduced["C"], shipped.C) @ states + _away(through, direct) @ known
     seen = seen + reduced["Dd"][:, nd:].magnitude @ equations + outputs
     terms = 4 * (nx + nu + nf + nd + 4)
-    found = np.concatenate([rounded_up(inside, terms), rounded_up(seen, terms)])
-    return dict(zip(remainder_names(shipped), found.tolist(), strict=True))
+    bounds = np.concatenate([rounded_up(inside, terms), rounded_up(seen, terms)])
+    return dict(zip(remainder_names(shipped), bounds.tolist(), strict=True))
 
 
 def _away(found: AffineMatrix, shipped: FloatArray) -> FloatArray:

@@ -148,8 +148,8 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
 
 def _disturbance_gains(plant: DescriptorSystem, points: ComplexArray, to_estimate: ComplexArray) -> FloatArray:
     """Return gains from each unknown input to each fault estimate ``(k, nf, nd)``."""
-    _, found, terms = _responses(plant, plant.Bd, plant.Dd, points, to_estimate)
-    return _above_rounding(np.abs(found), terms[:, None, None])
+    _, responses, terms = _responses(plant, plant.Bd, plant.Dd, points, to_estimate)
+    return _above_rounding(np.abs(responses), terms[:, None, None])
 
 
 def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:
@@ -204,8 +204,8 @@ def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:
     """Return the least ``x`` with ``pencil x = b``, where each row and column has a size near one."""
     nx = pencil.shape[1]
     scaled, columns = equilibrated(np.hstack([pencil, b]))
-    found = np.linalg.pinv(scaled[:, :nx], rcond=RANK_TOLERANCE) @ scaled[:, nx:]
-    return np.asarray(columns[:nx, None] * found / columns[nx:])
+    solution = np.linalg.pinv(scaled[:, :nx], rcond=RANK_TOLERANCE) @ scaled[:, nx:]
+    return np.asarray(columns[:nx, None] * solution / columns[nx:])
 
 
 @arguments_checked
@@ -244,27 +244,27 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     >>> obsynth.plotting.plot_gains(design).get_xlabel()
     'frequency (rad/s)'
     """
-    found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
+    gains, target = estimate_gains(design, to=to), TARGETS.get(to, "")
     panel = one_panel(axes, size=(WIDTH, 4.0))
     if to == "faults":
         panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
-    for name, gain in found.gains.items():
+    for name, gain in gains.gains.items():
         if np.any(gain > 0.0):
             ending = "" if np.all(gain > 0.0) else " (elsewhere only rounding)"
-            panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}{ending}", **_STYLES[name])
+            panel.plot(gains.frequencies, _positive(gain), label=f"{name} to {target}{ending}", **_STYLES[name])
         else:
             panel.plot([], [], label=f"{name}: zero gain", **_STYLES[name])
-    largest = found.gains.get("faults", found.least)
-    if to != "states" and np.any(found.least < VISIBLE_SHARE * largest):
-        panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST_LINE)
+    largest = gains.gains.get("faults", gains.least)
+    if to != "states" and np.any(gains.least < VISIBLE_SHARE * largest):
+        panel.plot(gains.frequencies, _positive(gains.least), label="faults, least singular value", **_LEAST_LINE)
     gamma = design.certificate.claims.get("gamma")
-    if to == "faults" and gamma is not None and "disturbances" in found.gains:
-        panel.plot(found.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
+    if to == "faults" and gamma is not None and "disturbances" in gains.gains:
+        panel.plot(gains.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
     plain_decades(panel)
     plain_decades(panel, across=True)
     panel.set_xlabel("frequency (rad/s)")
     panel.set_ylabel("singular value\n(unit of the estimate / of the input)")
-    if found.gains:
+    if gains.gains:
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     else:
         panel.set_title("The plant states no faults, disturbances or noise.")

@@ -71,21 +71,21 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     >>> obsynth.plotting.plot_least_thresholds(test).get_xlabel()
     'from the step to the last sample (s)'
     """
-    found = GuaranteedTest.of(design)
+    test = GuaranteedTest.of(design)
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
-    table = found.trade_off[np.isfinite(found.trade_off[:, 1])]
-    before = int(found.options["before"]) if found.options["course"] == "step" else 0
-    seconds = (table[:, 0] - 1 - before) * found.observer.dt
+    table = test.trade_off[np.isfinite(test.trade_off[:, 1])]
+    before = int(test.options["before"]) if test.options["course"] == "step" else 0
+    seconds = (table[:, 0] - 1 - before) * test.observer.dt
     panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
     panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms exists here")
     panel.plot(
-        (found.samples - 1 - before) * found.observer.dt,
-        found.threshold,
+        (test.samples - 1 - before) * test.observer.dt,
+        test.threshold,
         marker="s",
         markersize=9,
         color="tab:red",
         linestyle="none",
-        label=f"chosen: {found.samples} samples, proved",
+        label=f"chosen: {test.samples} samples, proved",
     )
     sizes = table[:, 1]
     if sizes.size and sizes.min() > 0.0 and sizes.max() > WIDE_THRESHOLDS * sizes.min():
@@ -97,7 +97,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         # What a few more samples bring is of interest where they are few.
         plain_decades(panel, across=True)
     after = "from the step to the last sample" if before else "from the first to the last sample"
-    return finish(panel, with_unit(found.fault, found.plant.units), below=f"{after} (s)")
+    return finish(panel, with_unit(test.fault, test.plant.units), below=f"{after} (s)")
 
 
 @arguments_checked
@@ -142,17 +142,17 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     >>> obsynth.plotting.plot_intervals(test, run.estimates).get_xlabel()
     'time (s)'
     """
-    found = GuaranteedTest.of(design)
+    test = GuaranteedTest.of(design)
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
-    low, high = found.interval(estimates)
-    seconds = np.arange(len(low)) * found.observer.dt
+    low, high = test.interval(estimates)
+    seconds = np.arange(len(low)) * test.observer.dt
     panel.fill_between(seconds, low, high, label="interval", **BAND_STYLE)
-    panel.plot(seconds, found.residual(estimates), label="residual", **RESIDUAL_STYLE)
+    panel.plot(seconds, test.residual(estimates), label="residual", **RESIDUAL_STYLE)
     panel.axhline(0.0, color="0.4", linewidth=0.8)
-    alarms = np.flatnonzero(found.alarms(estimates))
+    alarms = np.flatnonzero(test.alarms(estimates))
     if alarms.size:
         panel.axvline(float(seconds[alarms[0]]), color="#B2182B", linestyle=":", label="alarm")
-    return finish(panel, with_unit(found.fault, found.plant.units))
+    return finish(panel, with_unit(test.fault, test.plant.units))
 
 
 @arguments_checked
@@ -193,13 +193,13 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     >>> obsynth.plotting.plot_hidden_course(test).get_xlabel()
     'time (s)'
     """
-    found = GuaranteedTest.of(design)
-    plant, courses = found.plant, found.hidden_course(fault)
+    test = GuaranteedTest.of(design)
+    plant, courses = test.plant, test.hidden_course(fault)
     if not courses:
         raise SpecError("No combination of signals hides this fault: there is none to draw.", path="fault")
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     styles = dict.fromkeys(courses, "--")
-    styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(found.fault_names, "-")
+    styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(test.fault_names, "-")
     sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
     largest = max(sizes.values())
     shown = [name for name in courses if sizes[name] > ROUNDED_COURSE * largest]
@@ -207,7 +207,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     for i, name in enumerate(sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":")))):
         style, unit = styles.get(name, ":"), plant.units.get(name, "")
         panel.plot(
-            np.arange(len(courses[name])) * found.observer.dt,
+            np.arange(len(courses[name])) * test.observer.dt,
             courses[name] / sizes[name],
             style,
             color=LINE_COLOURS[i % len(LINE_COLOURS)],

@@ -135,8 +135,8 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     >>> obsynth.plotting.plot_delays(obsynth.optimal_filter(plant)).get_xlabel()
     'delay of the fault map (samples)'
     """
-    found = OptimalFilter.of(design)
-    table = found.trade_off
+    filter_ = OptimalFilter.of(design)
+    table = filter_.trade_off
     if not table:
         raise SpecError(
             f"Design {design.name!r} follows a reference model: there is no delay to choose.", path="design"
@@ -150,17 +150,17 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     for label, values, marker, style in lines:
         panel.plot(delays, values, color="black", marker=marker, markersize=4, linestyle=style, label=label)
     panel.plot(
-        found.delay,
-        found.gain,
+        filter_.delay,
+        filter_.gain,
         marker="s",
         markersize=9,
         color="tab:red",
         linestyle="none",
         zorder=0,
-        label=f"this filter: delay {found.delay}",
+        label=f"this filter: delay {filter_.delay}",
     )
-    if found.non_causal_limit > 0.0:
-        panel.axhline(found.non_causal_limit, color="0.5", linestyle="--", label="gain that no delay falls below")
+    if filter_.non_causal_limit > 0.0:
+        panel.axhline(filter_.non_causal_limit, color="0.5", linestyle="--", label="gain that no delay falls below")
     panel.set_xticks(delays)
     panel.set_ylim(bottom=0.0)
     return finish(panel, "error per unit of noise", below="delay of the fault map (samples)")
@@ -197,8 +197,8 @@ def draw_region_trade_off(
 def _claim_label(name: str, methods: Sequence[str]) -> str:
     """Return the name of a claim with its unit, as the methods state it."""
     known = (method_class(method).claims for method in dict.fromkeys(methods) if method in REGISTRY)
-    found = next((claims[name.partition("[")[0]] for claims in known if name.partition("[")[0] in claims), None)
-    return with_unit(name.replace("_", " "), {name.replace("_", " "): found.unit if found else ""})
+    claim = next((claims[name.partition("[")[0]] for claims in known if name.partition("[")[0] in claims), None)
+    return with_unit(name.replace("_", " "), {name.replace("_", " "): claim.unit if claim else ""})
 
 
 def _number(design: ObserverDesign, name: str) -> float:
