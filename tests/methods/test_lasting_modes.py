@@ -107,3 +107,14 @@ def test_a_zero_on_the_boundary_leaves_no_stable_filter(name: str, norm: str) ->
     )
     with pytest.raises(obsynth.PreconditionError, match="a zero that is not strictly stable"):
         obsynth.optimal_filter(plant, norm=norm)
+
+
+def test_what_holds_at_any_delay_holds_at_this_one() -> None:
+    """Of ``y_k = f_{k+2} + w_k`` nothing but the bound for any delay is proved, and the least gain is one."""
+    plant = obsynth.DescriptorSystem(
+        E=[[0, 1, 0], [0, 0, 1], [0, 0, 0]], A=np.eye(3), C=[[1, 0, 0]], Bf=[[0], [0], [1]], Bw=np.zeros((3, 1)),
+        Dw=[[1]], dt=1.0,
+    )  # fmt: skip
+    design = obsynth.optimal_filter(plant)
+    assert 0.9999 < design.least <= 1.0 < design.gain < 1.0 + 1e-8
+    assert "between 0.9999" in design.notes[0]

@@ -305,7 +305,9 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
     elif chosen.is_nothing:
         text = f"Least gain {of}: 0; this filter: 0 but for rounding."
     else:
-        low, high = bracketed(claims.get("least", 0.0), claims["gain"])
+        # What holds at any delay holds at this one.
+        least = max(claims.get("least", 0.0), claims.get("non_causal_limit", 0.0))
+        low, high = bracketed(least, claims["gain"])
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
     places = [row.found.fault_map.delays for row in curve]
     place = places.index(fault_map.delays) if fault_map.delays in places else len(curve)
