@@ -81,6 +81,11 @@ def test_without_pint_kelvin_beside_degrees_is_refused(design, tmp_path, monkeyp
     np.testing.assert_array_equal(obsynth.run_on_data(design, path).table["fhat[f1]"], expected["fhat[f1]"])
 
 
+def test_both_signs_of_micro_are_one_unit_without_pint(monkeypatch):
+    monkeypatch.setattr(measurement_units, "find_spec", lambda name: None)
+    assert conversion("\u00b5V", "\u03bcV") == (1.0, 0.0)
+
+
 @with_pint
 def test_conversions_are_exact_where_they_are_factors():
     assert conversion("mV", "V") == pytest.approx((1e-3, 0.0))

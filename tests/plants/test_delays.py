@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from test_export import through_c
 
 import obsynth
+from obsynth.plants.dead_times import seconds_of
 from obsynth.results.gain_set_writing import digest_of
 
 MATRICES = {"A": [[-1.0, 0.5], [0.0, -2.0]], "B": [[0.0], [1.0]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]]}
@@ -395,3 +396,8 @@ def test_on_logs_in_c_and_in_python_the_same(tmp_path):
 def test_methods_take_plants_whose_delays_became_states(method, delays):
     design = obsynth.design(obsynth.discretise(delayed(delays=delays, Bw=0.1 * np.eye(2)), 0.1), method)
     assert design.report.passed
+
+
+def test_both_signs_of_micro_are_microseconds():
+    texts = ("300 us", "300 \u00b5s", "300\u03bcs")
+    assert [seconds_of(text, "delays.u1") for text in texts] == pytest.approx([3e-4] * 3)

@@ -11,7 +11,16 @@ from obsynth.plants.noise import SensorNoise, kept_share, process_variance, seco
 
 
 def test_times_and_sizes() -> None:
-    times = {"200 ms": 0.2, "5 s": 5.0, "3 min": 180.0, "2 h": 7200.0, "1 d": 86400.0}
+    times = {
+        "200 ms": 0.2,
+        "5 s": 5.0,
+        "3 min": 180.0,
+        "2 h": 7200.0,
+        "1 d": 86400.0,
+        "9 us": 9e-6,
+        "9 \u00b5s": 9e-6,
+        "9\u03bcs": 9e-6,
+    }
     assert {text: seconds(text, "t") for text in times} == pytest.approx(times)
     assert SensorNoise(3.0, 1.0, 4.0).size == 5.0
 

@@ -80,7 +80,17 @@ def test_a_transform_of_a_plant_that_takes_none_is_refused(folder: str, tmp_path
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("100 ms", 0.1), ("1.1ms", 0.0011), ("250 us", 0.00025), ("2 s", 2.0), ("1.5 min", 90.0), ("1 h", 3600.0)],
+    [
+        ("100 ms", 0.1),
+        ("1.1ms", 0.0011),
+        ("250 us", 0.00025),
+        ("2 s", 2.0),
+        ("1.5 min", 90.0),
+        ("1 h", 3600.0),
+        # The sign of keyboards, and the letter of the Greek alphabet.
+        ("250 \u00b5s", 0.00025),
+        ("250 \u03bcs", 0.00025),
+    ],
 )
 def test_times_are_read_with_their_units(text: str, seconds: float, tmp_path: Path) -> None:
     transform = f"transform: {{eliminate_algebraic_states: true, sample_time: {text}}}\n"

@@ -55,8 +55,8 @@ def is_temperature(unit: str) -> bool:
 
 
 def _spelled(text: str, other: str) -> str:
-    """Return a unit without blanks around it; C and F are temperatures beside another one."""
-    text = text.strip()
+    """Return a unit without blanks around it, with one sign for micro; C and F are temperatures beside another one."""
+    text = text.strip().replace("\u03bc", "\u00b5")
     known = _TEMPERATURES.get(text, text)
     alone = text in ("C", "F") and other.strip() not in _TEMPERATURES
     return text if alone else known

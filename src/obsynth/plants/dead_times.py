@@ -74,7 +74,8 @@ def seconds_of(value: Any, name: str) -> float:
 
 
 def _seconds_in_text(text: str, name: str) -> float:
-    parts = _TEXT.fullmatch(text)
+    # Both signs of micro, that of keyboards and the Greek letter, are spelled with a u.
+    parts = _TEXT.fullmatch(text.replace("\u00b5", "u").replace("\u03bc", "u"))
     unit = "s" if parts is None or parts[2] is None else parts[2]
     try:
         return math.nan if parts is None else number_in_text(parts[1]) * SECONDS_IN_UNIT[unit]

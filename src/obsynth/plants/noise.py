@@ -29,7 +29,7 @@ OFFSET_SIZE, OFFSET_WALK = 10.0, 1e-3
 ASSUMED = "assumed noise"
 
 #: Units of time in s.
-SECONDS_OF_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+SECONDS_OF_UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def assumed_noise_names(outputs: Sequence[str]) -> list[str]:
@@ -107,7 +107,9 @@ class SensorNoise:
 
 def seconds(value: Any, path: str) -> float:
     """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
-    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
+    # Both signs of micro, that of keyboards and the Greek letter, are spelled with a u.
+    text = re.sub("[\u00b5\u03bc]s", "us", value) if isinstance(value, str) else ""
+    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", text)
     if found is not None and found[2] in SECONDS_OF_UNITS:
         try:
             return stated_number(float(found[1]) * SECONDS_OF_UNITS[found[2]], path)

@@ -60,7 +60,9 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 #: By what a number in each unit is multiplied, then divided, for seconds: 1.1 ms are 0.0011 s to the last digit.
 _SECONDS = {
     "us": (1.0, 1e6),
+    # The sign of keyboards, and the letter of the Greek alphabet.
     "\u00b5s": (1.0, 1e6),
+    "\u03bcs": (1.0, 1e6),
     "ms": (1.0, 1e3),
     "s": (1.0, 1.0),
     "min": (60.0, 1.0),
