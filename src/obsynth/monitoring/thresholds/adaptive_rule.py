@@ -63,21 +63,23 @@ class AdaptiveRule(Rule):
 
     def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, RuleOutput]:
         """Return the state, statistic and threshold: those of the residual's norm, or of the row passed most."""
-        said, dt = sample.said, self.plan.sample_time
-        if not isinstance(said, LinearSample):
+        observation, dt = sample.observation, self.plan.sample_time
+        if not isinstance(observation, LinearSample):
             return self.restart(state), RuleOutput(math.nan, math.nan, None, (math.nan,) * len(self.columns))
         last, state = state.last, state._replace(last=sample.time)
         if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
             # What the observer did over another interval is an error of its own, which must decay first.
             state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
         plan = self.plan if state.first else self._later
-        signals, bound = (said.inputs, said.outputs), plan.bound
-        without, thresholds = adaptive_step(bound, state.without, bound.structure.reading @ said.rows, *signals)
+        signals, bound = (observation.inputs, observation.outputs), plan.bound
+        without, thresholds = adaptive_step(bound, state.without, bound.structure.reading @ observation.rows, *signals)
         during, error = state.during, thresholds
         if plan.faults is not None and during is not None:
-            during, error = adaptive_step(plan.faults, during, plan.faults.structure.reading @ said.rows, *signals)
+            during, error = adaptive_step(
+                plan.faults, during, plan.faults.structure.reading @ observation.rows, *signals
+            )
         state = state._replace(without=without, during=during, waiting=max(state.waiting - 1, 0))
-        values, at = said.rows[len(said.rows) - len(thresholds.total) :], plan.residuals
+        values, at = observation.rows[len(observation.rows) - len(thresholds.total) :], plan.residuals
         if dt is None and self.nominal is not None and state.nominal is not None:
             nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
             state = state._replace(nominal=nominal)

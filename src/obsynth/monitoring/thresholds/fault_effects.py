@@ -24,7 +24,7 @@ from scipy.linalg import expm
 from obsynth.methods.registry import error_model
 from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
-from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_courses
+from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_profiles
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -108,17 +108,17 @@ class FaultEffects(ABC):
         )  # fmt: skip
 
     def step(
-        self, state: EffectState, said: Any, white: FloatArray, seen: NDArray[np.bool_] | None, *, counts: bool
+        self, state: EffectState, observation: Any, white: FloatArray, seen: NDArray[np.bool_] | None, *, counts: bool
     ) -> EffectState:
         """Return the state after a sample of which the observer ``said`` something: its residuals are ``white (m,)``,
         of which those that were ``seen (m,)`` are measured, or none (`None`)."""
-        if isinstance(said, DAERow) and said.k == 0:
+        if isinstance(observation, DAERow) and observation.k == 0:
             return self.init()
         state = self._with_begin(state)
         followed = np.isfinite(state.begun)
         rows = np.where(followed, state.row - state.begun + 1.0, 0.0)
         with np.errstate(all="ignore"):
-            error, past, added = self._moved(state, said, rows, seen)
+            error, past, added = self._moved(state, observation, rows, seen)
             error = error * followed[:, None, None]
             score, information, sums, count = state.score, state.information, state.sums, state.counts
             if counts and seen is not None:
@@ -132,7 +132,7 @@ class FaultEffects(ABC):
 
     @abstractmethod
     def _moved(
-        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ``error`` and ``past`` after a sample, which is one of so many ``rows (b,)`` from each begin, and the
         effects on its white residuals ``(b, m, h)``."""
@@ -188,23 +188,23 @@ class FilterEffects(FaultEffects):
         error[nx + np.arange(nq), np.arange(nq)] = 1.0
 
     def _moved(
-        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        if not isinstance(said, DAERow):
+        if not isinstance(observation, DAERow):
             return state.error, state.past, np.zeros((len(rows), self.model.channels, len(self.hypotheses)))
         nx, nq, ny = self._shapes
         moved, sensors, outputs = np.arange(nq), 2 * nq + np.arange(ny), np.arange(ny)
         error = state.error.copy()
         error[:, nx + moved, nq + moved] += 1.0
         step = np.eye(nx + nq)
-        step[:nx, :nx], step[:nx, nx:] = said.part("F"), said.part("G")
+        step[:nx, :nx], step[:nx, nx:] = observation.part("F"), observation.part("G")
         error = step @ error
-        reading = np.hstack([said.part("H"), said.part("L")])
+        reading = np.hstack([observation.part("H"), observation.part("L")])
         effect = reading @ error
         effect[:, outputs, sensors] += 1.0
         effect[:, outputs, sensors + ny] += rows[:, None]
-        effect[:, ~said.seen] = 0.0
-        error = error - _gain(said, reading, self.R) @ effect
+        effect[:, ~observation.seen] = 0.0
+        error = error - _gain(observation, reading, self.R) @ effect
         estimates = -error[:, nx:]
         estimates[:, moved, moved] += 1.0
         estimates[:, moved, nq + moved] += rows[:, None]
@@ -228,7 +228,7 @@ class LinearEffects(FaultEffects):
         pass
 
     def _moved(
-        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         return state.error, state.past, self.responses[np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)]
 
@@ -263,7 +263,7 @@ def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffec
     effects: FaultEffects | None = None
     if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
         effects = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
-    elif isinstance(observer, LinearObserver) and not expects_fault_courses(design):
+    elif isinstance(observer, LinearObserver) and not expects_fault_profiles(design):
         effects = LinearEffects(design, learned)
     return None if effects is None or effects.numbers > MOST_NUMBERS else effects
 
@@ -273,13 +273,13 @@ def _doublings(row: int) -> int:
     return min((row & -row).bit_length() - 1, MOST_DOUBLINGS)
 
 
-def _gain(said: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray:
+def _gain(observation: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray:
     """Return the gain ``(n, ny)`` of a sample on states and parameters, by the covariance after it: ``P H' R^-1``."""
-    nx, joint_covariance = len(said.x), np.empty((reading.shape[1], reading.shape[1]))
-    joint_covariance[:nx, :nx], joint_covariance[nx:, nx:] = said.covariance, said.parameter_covariance
-    joint_covariance[:nx, nx:] = said.cross_covariance
+    nx, joint_covariance = len(observation.x), np.empty((reading.shape[1], reading.shape[1]))
+    joint_covariance[:nx, :nx], joint_covariance[nx:, nx:] = observation.covariance, observation.parameter_covariance
+    joint_covariance[:nx, nx:] = observation.cross_covariance
     joint_covariance[nx:, :nx] = joint_covariance[:nx, nx:].T
-    measured, gain = said.seen, np.zeros((len(joint_covariance), len(reading)))
+    measured, gain = observation.seen, np.zeros((len(joint_covariance), len(reading)))
     gain[:, measured] = np.linalg.solve(R[measured][:, measured], reading[measured] @ joint_covariance).T
     return gain
 

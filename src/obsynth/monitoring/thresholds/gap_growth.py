@@ -94,7 +94,11 @@ class GapGrowth:
         for _ in range(sample.skipped):
             state = self._without(state, np.ones(len(self._H), dtype=bool))
         grown = float(np.linalg.norm(self._C @ state.columns, axis=0).sum())
-        outputs = sample.said.outputs if isinstance(sample.said, LinearSample) else np.full(len(self._H), np.nan)
+        outputs = (
+            sample.observation.outputs
+            if isinstance(sample.observation, LinearSample)
+            else np.full(len(self._H), np.nan)
+        )
         return self._without(state, np.isnan(outputs)), grown
 
     def _without(self, state: GapState, missing: np.ndarray) -> GapState:

@@ -179,8 +179,8 @@ class _RecordRule(NormRule):
         for run in range(norm.shape[1]):
             state = self._tests.init()
             for k, row in enumerate(runs.rows[:, run]):
-                said = LinearSample(row, runs.inputs[k, run], runs.outputs[k, run], self._states)
-                state, judged = self._tests.step(state, Sample(k * self._dt, row[:0], row[:0], said))
+                observation = LinearSample(row, runs.inputs[k, run], runs.outputs[k, run], self._states)
+                state, judged = self._tests.step(state, Sample(k * self._dt, row[:0], row[:0], observation))
                 passed[k, run] |= judged.statistic > judged.threshold
                 if onset is not None and k >= onset and passed[k, run]:
                     break
@@ -226,9 +226,13 @@ class GuaranteedRule(Rule):
 
     def step(self, state: GuaranteedState, sample: Sample) -> tuple[GuaranteedState, RuleOutput]:
         """Return statistic and threshold; NaN while the window is not full, and nothing else is known of it."""
-        said: Any = sample.said
+        observation: Any = sample.observation
         cells = (np.nan,) * len(self.columns)
-        signals = np.full(len(state.largest), np.nan) if said is None else np.concatenate([said.inputs, said.outputs])
+        signals = (
+            np.full(len(state.largest), np.nan)
+            if observation is None
+            else np.concatenate([observation.inputs, observation.outputs])
+        )
         if self._programmes:
             state = self._kept(state, signals[None])
         complete = bool(np.isfinite(signals).all())
@@ -237,7 +241,7 @@ class GuaranteedRule(Rule):
             state = self.restart(state)
         thresholds = self._limits + self._rounding @ state.largest
         if state.rows >= self._length and (sample.deciding or self._solve):
-            values = np.asarray(said.faults_and_residuals[: len(thresholds)], dtype=np.float64)
+            values = np.asarray(observation.faults_and_residuals[: len(thresholds)], dtype=np.float64)
         elif self._solve and len(state.recent) == self._length:
             least_tests = [
                 programme.least_test(*self._window(state, k)) for k, programme in enumerate(self._programmes)
@@ -319,14 +323,14 @@ class VaryingRule(Rule):
 
     def step(self, state: VaryingState, sample: Sample) -> tuple[VaryingState, RuleOutput]:
         """Return statistic and threshold; NaN where the row has no verdict."""
-        said: Any = sample.said
-        signals = np.concatenate([said.inputs, said.outputs])
+        observation: Any = sample.observation
+        signals = np.concatenate([observation.inputs, observation.outputs])
         after = VaryingState(state.k + 1, np.fmax(state.largest, np.abs(signals)))
         programme = self._observer.programme_at(state.k)
         if programme < 0:
             return after, RuleOutput(np.nan, np.nan)
         threshold = float(self._limits[programme] + self._rounding[programme] @ after.largest)
-        return after, RuleOutput(float(abs(said.faults_and_residuals[0])), threshold, 0)
+        return after, RuleOutput(float(abs(observation.faults_and_residuals[0])), threshold, 0)
 
     def restart(self, state: VaryingState, skipped: int = 0) -> VaryingState:
         """Count the rows that are missing: those of the window before them have no verdict."""

@@ -263,7 +263,7 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     direction."""
     names = [watched_names(design)[i] for i in kept]
     directions = list(np.diag(sizes))
-    if not isinstance(design.observer, LinearObserver) or expects_fault_courses(design):
+    if not isinstance(design.observer, LinearObserver) or expects_fault_profiles(design):
         return np.array(directions), tuple(names)
     errors = error_model(design)
     observer, plant = errors.observer, errors.plant
@@ -282,7 +282,7 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     return np.array(directions), tuple(names)
 
 
-def expects_fault_courses(design: ObserverDesign) -> bool:
+def expects_fault_profiles(design: ObserverDesign) -> bool:
     """Whether a linear observer expects faults of a course, such as a step, which leave nothing in its residuals once
     it has followed them."""
     return isinstance(design.observer, LinearObserver) and error_model(design).Phi is not None

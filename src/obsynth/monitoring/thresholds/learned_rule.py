@@ -101,8 +101,8 @@ class LearnedRule(Rule):
         for _ in range(min(max(missing, 0), max(AGES))):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
-        state = self._scored(state, sample.said, max(missing, 0))
-        values_of_row = watched_values(sample.residuals, sample.said)
+        state = self._scored(state, sample.observation, max(missing, 0))
+        values_of_row = watched_values(sample.residuals, sample.observation)
         complete = values_of_row is not None and sample.deciding and bool(np.isfinite(values_of_row[self._usual]).all())
         evidence = (
             None
@@ -110,20 +110,20 @@ class LearnedRule(Rule):
             else self._completed(state, values_of_row, complete=complete)
         )
         counts = evidence is not None and state.taken > self.learned.settling
-        most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
-        if counts and state.waiting and isinstance(sample.said, Evidence):
-            most = float(np.linalg.norm(sample.said.whitened)) / self.learned.innovation
+        most, varying = math.inf if counts else 0.0, isinstance(sample.observation, Evidence)
+        if counts and state.waiting and isinstance(sample.observation, Evidence):
+            most = float(np.linalg.norm(sample.observation.whitened)) / self.learned.innovation
         if not complete and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
         if values_of_row is None or not (
             complete or (varying and (counts or np.isfinite(values_of_row[self._places]).all()))
         ):
-            return self._followed(self._added(state, None), sample.said), RuleOutput(math.nan, math.nan)
+            return self._followed(self._added(state, None), sample.observation), RuleOutput(math.nan, math.nan)
         watched = values_of_row[self._places]
         kept = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
         state = self._followed(
-            self._added(state, kept, most, evidence), sample.said, np.isfinite(watched), counts=counts
+            self._added(state, kept, most, evidence), sample.observation, np.isfinite(watched), counts=counts
         )
         if not counts:
             return state, RuleOutput(math.nan, math.nan)
@@ -135,7 +135,7 @@ class LearnedRule(Rule):
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
             changes = self._changes(state, self._bands)
-            squares = self._squares(sample.said)
+            squares = self._squares(sample.observation)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         # Faults are compared without what their slow offsets explain: each has its own.
@@ -149,18 +149,20 @@ class LearnedRule(Rule):
         return state, RuleOutput(float(values.max()), 1.0, fault, (), ranking)
 
     def _followed(
-        self, state: LearnedState, said: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
+        self, state: LearnedState, observation: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
     ) -> LearnedState:
         """Return the state with the effects of faults and sensors on a row, of which so much was ``seen (m,)``."""
         if self.effects is None:
             return state
-        return state._replace(effects=self.effects.step(state.effects, said, state.white[-1], seen, counts=counts))
+        return state._replace(
+            effects=self.effects.step(state.effects, observation, state.white[-1], seen, counts=counts)
+        )
 
-    def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
+    def _scored(self, state: LearnedState, observation: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""
-        if self._walk is None or not isinstance(said, Evidence):
+        if self._walk is None or not isinstance(observation, Evidence):
             return state
-        before, scores = sample_score(state.before, said, self._walk, missing + 1)
+        before, scores = sample_score(state.before, observation, self._walk, missing + 1)
         row = np.concatenate([scores.away(self.learned.centres), np.diag(scores.information)])
         gone = min(missing, max(AGES))
         kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
@@ -175,12 +177,12 @@ class LearnedRule(Rule):
         away, power = np.hsplit(sums, 2)
         return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
 
-    def _squares(self, said: Any) -> FloatArray:
+    def _squares(self, observation: Any) -> FloatArray:
         """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
-        if self._walk is None or not isinstance(said, Evidence):
+        if self._walk is None or not isinstance(observation, Evidence):
             return np.zeros(0 if self._walk is None else len(self._walk))
-        away = beyond(said.theta - self.learned.centres, self._bands)
-        return np.asarray(away**2 / np.diag(said.parameter_covariance))
+        away = beyond(observation.theta - self.learned.centres, self._bands)
+        return np.asarray(away**2 / np.diag(observation.parameter_covariance))
 
     def _fault(self, watched: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""

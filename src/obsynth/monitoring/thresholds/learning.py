@@ -336,19 +336,19 @@ def _without_pairs(
     started: Callable[[], LogRun],
     log: FloatArray,
     ends: Sequence[tuple[int, int]],
-    said: _ObserverOutput,
+    observation: _ObserverOutput,
     every: float,
 ) -> tuple[_ObserverOutput, WrongPairs]:
     """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
     from scipy.special import pdtrc
 
-    if not said.refused:
-        return said, NO_PAIRS
-    before = log.shape[1] - said.refused[0].shape[1]
+    if not observation.refused:
+        return observation, NO_PAIRS
+    before = log.shape[1] - observation.refused[0].shape[1]
     y = log[:, before:]
-    pairs = believed_pairs(said.refused, y)
+    pairs = believed_pairs(observation.refused, y)
     if not pairs:
-        return said, NO_PAIRS
+        return observation, NO_PAIRS
 
     def again(chosen: Sequence[Pair]) -> _ObserverOutput:
         return _output_of_logs(design, started, np.hstack([log[:, :before], without(y, chosen)]), ends)
@@ -364,7 +364,7 @@ def _without_pairs(
     # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
     are_chance = chance * every <= MOST_OF_RATE and float(pdtrc(len(wrong) - 1, chance * len(y))) >= CHANCE
     if not wrong or not are_chance:
-        return said, NO_PAIRS
+        return observation, NO_PAIRS
     return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)
 
 

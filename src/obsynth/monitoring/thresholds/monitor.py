@@ -106,7 +106,7 @@ class Sample(NamedTuple):
     time: float  # seconds
     residuals: FloatArray  # ``(nr,)``
     faults: FloatArray  # ``(nf,)``
-    said: Evidence | LinearSample | None  # by the observer; nothing in a gap
+    observation: Evidence | LinearSample | None  # by the observer; nothing in a gap
     deciding: bool = True  # whether a decision may be taken: not in gaps, and not during the warm-up
     skipped: int = 0  # rows that were missing before this one
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up

@@ -94,9 +94,9 @@ class ParameterRule(Rule):
         """Return the state before the first sample."""
         return ParameterRuleState(np.zeros(2 * len(self.nominal)))
 
-    def fold(self, state: ParameterRuleState, said: Any) -> tuple[ParameterRuleState, tuple[float, int | None]]:
+    def fold(self, state: ParameterRuleState, observation: Any) -> tuple[ParameterRuleState, tuple[float, int | None]]:
         """Return the state after what an observer says at a sample, the statistic, and the number of the parameter."""
-        evidence: ParameterEvidence = said
+        evidence: ParameterEvidence = observation
         if self._kind == "cusum":
             along = evidence.score - evidence.information @ self.nominal
             levels = two_sided_sums(state.levels, along, np.diag(evidence.information), self._change)
@@ -129,7 +129,7 @@ class ParameterRule(Rule):
         """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
         if not sample.deciding:
             return state, NOT_DECIDED
-        state, (value, parameter) = self.fold(state, cast(Any, sample.said))
+        state, (value, parameter) = self.fold(state, cast(Any, sample.observation))
         if self._kind == "nis" and not sum(state.degrees):
             return state, NOT_DECIDED
         state = state._replace(looks=state.looks + 1)

@@ -107,7 +107,7 @@ class NormRule(Rule):
 
     def step(self, state: NormState, sample: Sample) -> tuple[NormState, RuleOutput]:
         """Return the state after a sample, statistic and threshold."""
-        said: Any = sample.said
+        observation: Any = sample.observation
         late = 0.0 if state.last is None else (sample.time - state.last - self._dt) / self._dt
         begin = sample.time if state.begin is None else state.begin
         regular = state.regular and abs(late) <= SAME_INTERVAL
@@ -120,7 +120,7 @@ class NormRule(Rule):
             late=state.late or (self.irregular is not None and late > FITTING_SHARE),
         )
         if self._driven is not None:
-            state = self._with_inputs(self._driven, state, said)
+            state = self._with_inputs(self._driven, state, observation)
         k = math.floor((sample.time - begin) / self._dt * (1.0 + COUNT_ROUNDING))
         table, limit = self._regular if regular or self.irregular is None else self.irregular
         threshold = float(table[k]) if k < len(table) else limit
@@ -133,13 +133,13 @@ class NormRule(Rule):
             state, threshold = state._replace(gap=gap), threshold + grown
         if not sample.deciding:
             return state, RuleOutput(math.nan, threshold)
-        state, value = self.fold(state, sample.residuals if self._watched is None else said.rows[self._watched])
+        state, value = self.fold(state, sample.residuals if self._watched is None else observation.rows[self._watched])
         return state, RuleOutput(value, threshold)
 
-    def _with_inputs(self, driven: InputResponse, state: NormState, said: Any) -> NormState:
+    def _with_inputs(self, driven: InputResponse, state: NormState, observation: Any) -> NormState:
         """Return the state with the known inputs of a row, and what they add to the norm; in a gap they are held."""
         before, states = state.inputs, state.driven
-        u = before if said is None or not np.isfinite(said.inputs).all() else said.inputs
+        u = before if observation is None or not np.isfinite(observation.inputs).all() else observation.inputs
         if u is None:
             return state
         moved = state.moved

@@ -16,7 +16,7 @@ from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
     from obsynth.monitoring.thresholds.learned import LEARNED
-    from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_courses
+    from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_profiles
     from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, learn_thresholds
 
     logs = options.data
@@ -59,7 +59,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
     if dependent := [name for name in learned.left_out if name not in learned.seldom]:
         lines.append(f"Left out (redundant or too slowly varying): {', '.join(dependent)}.")
     estimates_are_left_out = not any(name.startswith("fhat[") for name in learned.columns)
-    if learned.left_out and expects_fault_courses(design) and estimates_are_left_out:
+    if learned.left_out and expects_fault_profiles(design) and estimates_are_left_out:
         lines.append(
             "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
             "not at all. Give run a level for the estimate as well (--threshold)."
