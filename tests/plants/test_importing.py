@@ -305,6 +305,20 @@ def test_a_spec_may_have_its_plant_in_a_mat_file(tmp_path):
         obsynth.load_spec(spec)
 
 
+def with_description(built, before, after):
+    """Return an FMU whose description has another text in one place."""
+    changed = built.with_name("changed.fmu")
+    with zipfile.ZipFile(built) as source, zipfile.ZipFile(changed, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            if name == "modelDescription.xml":
+                assert before.encode() in data
+                data = data.replace(before.encode(), after.encode())
+                data = data.replace(b"</UnitDefinitions>", b'<Unit name="min"/></UnitDefinitions>')
+            target.writestr(name, data)
+    return changed
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("version", "before", "after", "words"),
@@ -314,11 +328,16 @@ def test_a_spec_may_have_its_plant_in_a_mat_file(tmp_path):
         ("3.0", "</ModelVariables>", '<Clock name="tick" valueReference="50" causality="local" '
          'intervalVariability="constant" intervalDecimal="0.1"/></ModelVariables>', "the clock 'tick'"),
         ("3.0", "</ModelVariables>", '<Boolean name="open" valueReference="51" causality="input" variability="discrete"'
-         ' start="false"/></ModelVariables>', "inputs open are no continuous"),
+         ' start="false"/></ModelVariables>', r"inputs open \(Boolean\) are no continuous"),
         ("2.0", "</ModelVariables>", '<ScalarVariable name="mode" valueReference="52" causality="input" '
-         'variability="discrete"><Integer start="1"/></ScalarVariable></ModelVariables>', "inputs mode are no"),
+         'variability="discrete"><Integer start="1"/></ScalarVariable></ModelVariables>',
+         r"inputs mode \(Integer\) are no"),
         ("2.0", 'name="outflow" valueReference="5" causality="output" variability="continuous"',
          'name="outflow" valueReference="5" causality="output" variability="discrete"', "outputs outflow are no"),
+        ("3.0", "</ModelVariables>", '<Boolean name="full" valueReference="53" causality="output" '
+         'variability="discrete"/></ModelVariables>', r"outputs full \(Boolean\) are no .* the others are left out"),
+        ("2.0", "</ModelVariables>", '<ScalarVariable name="stage" valueReference="54" causality="output" '
+         'variability="discrete"><Integer/></ScalarVariable></ModelVariables>', r"outputs stage \(Integer\) are no"),
     ],
 )  # fmt: skip
 def test_what_a_description_of_an_fmu_says_and_a_linear_model_does_not_have_is_named(
@@ -327,14 +346,18 @@ def test_what_a_description_of_an_fmu_says_and_a_linear_model_does_not_have_is_n
     pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
     from tank_fmu import tank
 
-    built, changed = tank(tmp_path, version), tmp_path / "changed.fmu"
-    with zipfile.ZipFile(built) as source, zipfile.ZipFile(changed, "w") as target:
-        for name in source.namelist():
-            data = source.read(name)
-            if name == "modelDescription.xml":
-                assert before.encode() in data
-                data = data.replace(before.encode(), after.encode())
-                data = data.replace(b"</UnitDefinitions>", b'<Unit name="min"/></UnitDefinitions>')
-            target.writestr(name, data)
+    changed = with_description(tank(tmp_path, version), before, after)
     with pytest.raises(SpecError, match=words):
         obsynth.from_fmu(changed, equilibrium=True)
+
+
+def test_outputs_of_an_fmu_that_are_named_leave_out_a_boolean_one(tmp_path):
+    pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
+    from tank_fmu import tank
+
+    full = '<Boolean name="full" valueReference="53" causality="output" variability="discrete"/></ModelVariables>'
+    path = with_description(tank(tmp_path, "3.0"), "</ModelVariables>", full)
+    plant = obsynth.from_fmu(path, equilibrium=True, outputs=["level", "outflow"])
+    assert plant.output_names == ("level", "outflow")
+    with pytest.raises(SpecError, match=r"'full' is of type Boolean.*leave it out of outputs"):
+        obsynth.from_fmu(path, equilibrium=True, outputs=["level", "full"])

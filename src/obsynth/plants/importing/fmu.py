@@ -266,7 +266,7 @@ def from_fmu(
     SpecError
         fmpy is not installed, the file is no such FMU, a name is unknown, its time is not in seconds, it has a clock,
         or, unless ``inputs`` and ``outputs`` say which to use, inputs that are no continuous real numbers or outputs
-        that change at events alone.
+        that are no real numbers (Boolean, Integer, Enumeration and so on) or change at events alone.
     PreconditionError
         The operating point is no equilibrium (a linear model of deviations would not be one), or none is found.
 
@@ -395,17 +395,25 @@ def _require_linear_meaning(
         "outputs": [
             v
             for v in description.modelVariables
-            if v.causality == "output" and v.type in _REAL and v.variability == "discrete"
+            if v.causality == "output" and (v.type not in _REAL or v.variability == "discrete")
         ],
     }
+    left = {"inputs": "keep the values that they start with", "outputs": "are left out"}
     for what, picked in (("inputs", inputs), ("outputs", outputs)):
         if picked is None and strange[what]:
-            names = ", ".join(v.name for v in strange[what])
+            names = ", ".join(v.name if v.type in _REAL else f"{v.name} ({v.type})" for v in strange[what])
             raise SpecError(
                 f"{path}: its {what} {names} are no continuous real numbers, and a linear model has no such signal: "
-                f"name those that it shall have by {what}=[...]; the others keep the values that they start with.",
+                f"name those that it shall have by {what}=[...]; the others {left[what]}.",
                 path=what,
             )
+        for variable in strange[what]:
+            if picked is not None and variable.type not in _REAL and variable.name in picked:
+                raise SpecError(
+                    f"{path}: {variable.name!r} is of type {variable.type}, and a linear model has real numbers "
+                    f"({' or '.join(_REAL)}) alone: leave it out of {what}.",
+                    path=what,
+                )
 
 
 def _is_continuous(variable: Any) -> bool:
