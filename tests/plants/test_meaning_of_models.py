@@ -111,6 +111,24 @@ def test_a_quantity_is_converted_where_the_plant_states_the_unit():
     assert in_unit(3.0, None, "x") == 3.0
 
 
+class FloatQuantity(np.ndarray):
+    """A number with a unit, as unyt and astropy have it: an array that also passes for a number."""
+
+    units, value = "mV", property(lambda self: np.asarray(self))
+
+
+def test_a_quantity_in_the_noise_of_a_model_is_refused_instead_of_stripped():
+    model = obsynth.DAEModel(equations={"rate": "der(x) = -x"}, outputs={"y1": "x"}, states={"x": 0.0})
+    size = np.array(5.0).view(FloatQuantity)
+    with pytest.raises(obsynth.SpecError, match=r"process_noise\.rate is a quantity in mV"):
+        obsynth.linearise(model, process_noise={"rate": size})
+    with pytest.raises(obsynth.SpecError, match=r"process_noise\.rate is a quantity in mV"):
+        obsynth.with_noise(model, process_noise={"rate": size}, dt=0.1)
+    for noise in (size, {"deviation": size}, {"deviation": 0.1, "correlation": 2.0, "white": size}):
+        with pytest.raises(obsynth.SpecError, match=r"sensor_noise\.y1.* is a quantity in mV"):
+            obsynth.with_noise(model, sensor_noise={"y1": noise})
+
+
 def test_a_quantity_is_refused_where_no_unit_is_stated_or_another_one():
     for units in ({}, {"y1": "K"}):
         with pytest.raises(obsynth.SpecError, match="quantity in mV"):

@@ -20,6 +20,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from obsynth.errors import SpecError, a_kind
 from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
+from obsynth.numerics.quantities import require_plain
 
 #: Messages give the number of digits of whole numbers beyond this.
 LONGEST_SHOWN = 10**30
@@ -114,7 +115,9 @@ def real_number(
     below: float = math.inf,
     path: str | None = None,
 ) -> float:
-    """Return a finite number in a range; raise `SpecError` naming the argument and ``what`` it should be."""
+    """Return a finite number in a range; raise `SpecError` naming the argument and ``what`` it should be, also for
+    a quantity: its unit would be lost."""
+    value = require_plain(value, name)
     if not is_finite_number(value) or not (above < value < below and value >= least):
         raise SpecError(f"{name} is {shown(value)}: give {what}.", path=path or name)
     return float(value)
