@@ -400,6 +400,27 @@ def test_what_no_model_has_and_damaged_files_of_7_3_are_refused(tmp_path):
             obsynth.from_matlab(path)
 
 
+@pytest.mark.parametrize("kind", ["ss", "tf", "interval"])
+def test_an_object_of_matlab_in_a_file_of_7_3_is_named_with_what_to_save(tmp_path, kind):
+    # An object is six marks in whole numbers; of a class that begins as int8 does they were taken for numbers.
+    path = hdf5_written(tmp_path / "object.mat", {"A": [[-1.0]], "C": [[1.0]], "Ts": 0.0})
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed (obsynth[hdf5])")
+    with h5py.File(path, "r+") as file:
+        item = file.create_dataset("plant", data=np.array([[0xDD000000, 2, 1, 1, 1, 1]], dtype=np.uint32))
+        item.attrs["MATLAB_class"], item.attrs["MATLAB_object_decode"] = np.bytes_(kind), np.int32(3)
+    with pytest.raises(obsynth.SpecError, match=rf"plant is an object of MATLAB's class {kind} .*dssdata\(plant\)"):
+        obsynth.from_matlab(path)
+
+
+def test_remarks_of_a_struct_of_7_3_may_be_objects(tmp_path):
+    # struct(sys) has Notes as MATLAB's strings, which are objects.
+    path = hdf5_written(tmp_path / "noted.mat", {"A": [[-1.0]], "C": [[1.0]], "Ts": 0.0}, more=[("Notes", "string")])
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed (obsynth[hdf5])")
+    with h5py.File(path, "r+") as file:
+        file["sys/Notes"].attrs["MATLAB_object_decode"] = np.int32(3)
+    assert obsynth.from_matlab(path).A.tolist() == [[-1.0]]
+
+
 def test_without_h5py_a_file_of_7_3_says_what_to_install(tmp_path, monkeypatch):
     path = tmp_path / "new.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(400))

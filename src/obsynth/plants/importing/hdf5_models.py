@@ -12,6 +12,9 @@ import scipy.sparse
 from obsynth.numerics.arrays import require_readable
 from obsynth.numerics.libraries import imported
 
+#: What a struct of a system has for remarks: objects there (MATLAB's strings) are left out.
+_REMARKS = ("Notes", "UserData")
+
 
 def hdf5_arrays(source: Path) -> dict[str, Any]:
     """Return variables by name, as ``scipy.io.loadmat`` has those of older files.
@@ -31,12 +34,13 @@ def hdf5_arrays(source: Path) -> dict[str, Any]:
 def _value(item: Any, file: Any, h5py: Any) -> Any:
     kind = item.attrs.get("MATLAB_class", b"double")
     kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+    _require_no_object(item, kind)
     if isinstance(item, h5py.Group):
         if "MATLAB_sparse" in item.attrs:
             return _sparse(item)
         if kind != "struct":
             raise ValueError(f"{item.name} is a {kind}, which is not read: save struct(sys) or the matrices")
-        return _struct({name: _value(item[name], file, h5py) for name in item})
+        return _struct({name: _value(item[name], file, h5py) for name in item if not _is_remark(item[name], name)})
     require_readable(math.prod(item.shape))
     if item.attrs.get("MATLAB_empty", 0):
         return np.zeros(tuple(int(size) for size in np.ravel(item[()])), dtype=object if kind == "cell" else float)
@@ -54,6 +58,22 @@ def _value(item: Any, file: Any, h5py: Any) -> Any:
     if kind not in ("double", "single", "logical") and not kind.startswith(("int", "uint")):
         raise ValueError(f"{item.name} is a {kind}, which is not read: save struct(sys) or the matrices")
     return raw.astype(np.float64)
+
+
+def _is_remark(item: Any, name: str) -> bool:
+    return name in _REMARKS and "MATLAB_object_decode" in item.attrs
+
+
+def _require_no_object(item: Any, kind: str) -> None:
+    """Refuse an object: what stands in its place are marks of MATLAB's, and its numbers lie where no name tells."""
+    if "MATLAB_object_decode" not in item.attrs or kind == "function_handle":
+        return
+    name = str(item.name).strip("/").replace("/", ".")
+    raise ValueError(
+        f"{name} is an object of MATLAB's class {kind} in a file of version 7.3, which MATLAB alone can unpack. Of a "
+        f"system write there [A,B,C,D,E,Ts] = dssdata({name}); save('plant.mat','A','B','C','D','E','Ts'), or "
+        f"s = struct({name}); save('plant.mat','s'), which keeps the names; leave other objects out of the file"
+    )
 
 
 def _struct(fields: dict[str, Any]) -> Any:
