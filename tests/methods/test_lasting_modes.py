@@ -118,3 +118,26 @@ def test_what_holds_at_any_delay_holds_at_this_one() -> None:
     design = obsynth.optimal_filter(plant)
     assert 0.9999 < design.least <= 1.0 < design.gain < 1.0 + 1e-8
     assert "between 0.9999" in design.notes[0]
+
+
+@pytest.mark.long
+def test_the_filter_for_more_noise_is_kept_where_less_cannot_be_proved() -> None:
+    """A double integrator beside four states: with a tenth of the added noise, rounding spoils the proof."""
+    A = np.zeros((6, 6))
+    A[:4, :4] = [[-0.74, 0.06, -0.62, -0.81], [-0.81, -0.73, 0.2, 0.16], [0.05, -1.17, 0.01, 0.25],
+                 [0.82, -0.16, 0.36, 0.76]]  # fmt: skip
+    A[4:, 4:] = [[1.0, 1.0], [0.0, 1.0]]
+    Bw = np.zeros((6, 4))
+    Bw[:4, 0] = [0.94, -2.82, 0.94, 0.41]
+    plant = obsynth.DescriptorSystem(
+        E=None, A=A, Bw=Bw, Dw=np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), dt=1.0,
+        Bf=[[-0.13, 0.8], [-1.34, 0.03], [-0.15, -0.88], [0.26, -0.21], [-1.58, -0.19], [1.23, 0.33]],
+        C=[[2.49, -1.15, -0.94, -0.11, 0.22, 0.35], [-1.02, -0.19, -0.5, -0.35, 0.64, -0.55],
+           [0.65, 0.27, -0.44, -0.5, 0.62, -0.59]],
+        Df=[[0.58, 0.81], [1.57, 2.41], [-0.94, 0.74]],
+    )  # fmt: skip
+    design = obsynth.optimal_filter(plant, delay=8)
+    assert obsynth.verify(design).passed
+    claims = design.certificate.claims
+    # The noise that was added is a hundredth of the plant's own.
+    assert claims["least"] <= claims["gain"] <= 1.01 * claims["least"]
