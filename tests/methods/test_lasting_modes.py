@@ -38,7 +38,7 @@ def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
     plant = obsynth.DescriptorSystem(**PLANTS[name])
     design = obsynth.optimal_filter(plant)
     assert design.report.passed
-    assert "lasts, and no noise drives it" in design.notes[-1]
+    assert "does not decay, and no noise drives it" in design.notes[-1]
     poles = np.linalg.eigvals(design.observer.Az)
     assert np.max(np.abs(poles)) < 1.0 if plant.is_discrete else np.max(poles.real) < 0.0
 
@@ -141,3 +141,18 @@ def test_the_filter_for_more_noise_is_kept_where_less_cannot_be_proved() -> None
     claims = design.certificate.claims
     # The noise that was added is a hundredth of the plant's own.
     assert claims["least"] <= claims["gain"] <= 1.01 * claims["least"]
+
+
+@pytest.mark.parametrize("mode", [1.0, 1.3])
+def test_nothing_is_said_of_all_stable_filters_where_a_mode_may_grow(mode: float) -> None:
+    """For a mode of 1.3 the Riccati equation has a stabilising solution: a stable filter is least among them."""
+    A = [[mode, 0.0], [0.0, 0.2]]
+    plant = obsynth.DescriptorSystem(
+        E=None, A=A, Bf=[[0], [1]], Bw=np.zeros((2, 3)), C=[[1, 0], [0, 1], [1, 1]], Df=[[1], [0], [2]], Dw=np.eye(3),
+        dt=1.0,
+    )  # fmt: skip
+    with pytest.raises(obsynth.SolverError, match="does not decay") as refusal:
+        obsynth.optimal_filter(plant, norm="h2")
+    assert "none has" not in str(refusal.value)
+    driven = plant.replace(Bw=np.hstack([np.zeros((2, 3)), [[1.0], [0.0]]]), Dw=np.eye(3, 4), noise_names=[*"abcd"])
+    assert obsynth.optimal_filter(driven, norm="h2").report.passed

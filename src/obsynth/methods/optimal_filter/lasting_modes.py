@@ -1,8 +1,9 @@
 """Modes that last and that no noise drives: integrators of a constant, oscillations that go on.
 
-Their part of the error decays only where the filter reads them, which costs noise: of all causal filters no stable one
-reaches the least gain, and some come as near as one likes.  The filter is designed as if a little noise drove them, and
-its claims are those for the plant as it is.
+Their part of the error decays only where the filter reads them, which costs noise: where they are on the boundary of
+stability, no stable filter reaches the least gain of all causal ones, and some come as near as one likes.  Beyond it
+(modes that grow) a gap may stay.  The filter is designed as if a little noise drove them, and its claims are those for
+the plant as it is.
 """
 
 from __future__ import annotations

@@ -53,8 +53,9 @@ CLOSED_GAP = 3e-5
 #: Noise of the sensors that is tried to bring them together, of the outputs' sizes; with more states it takes too long.
 OFFERED_NOISES, MOST_STATES_OF_OFFERS = (1e-4, 1e-3, 1e-2), 16
 LASTING_NOTE = (
-    "A mode of the plant lasts, and no noise drives it: no stable filter reaches the least gain. This one was found "
-    "with a little noise on that mode; its claims are for the plant without it."
+    "A mode of the plant does not decay, and no noise drives it: a filter of least gain may ignore it, and its "
+    "errors do not decay then. This one was found with a little noise on that mode; its claims are for the plant "
+    "without it."
 )
 #: Significant digits of a bound in words.
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
@@ -79,8 +80,9 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
             raise
     if asked.norm == "h2":
         raise SolverError(
-            "A mode of the plant lasts, and no noise drives it: of all stable filters none has the least mean square, "
-            "and the result is inconclusive. State noise that drives it (Bw), or take norm hinf."
+            "A mode of the plant does not decay, and no noise drives it: the filter of least mean square from rest may "
+            "ignore it, and its errors do not decay then. The result is inconclusive. State noise that drives it (Bw), "
+            "or take norm hinf."
         )
     progress("searching the least gain with noise on modes that last")
     return _with_lasting_modes(plant, asked)
