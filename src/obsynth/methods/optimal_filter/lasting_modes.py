@@ -51,10 +51,13 @@ def _undriven(e: FloatArray, a: FloatArray, noise: FloatArray, *, discrete: bool
         lasting = modes[np.abs(modes) >= STABLE_RADIUS]
     else:
         lasting = modes[modes.real >= -AXIS_SHARE * np.max(np.abs(modes), initial=0.0)]
-    columns = [np.zeros((len(a), 0))]
+    columns: list[FloatArray] = []
     for mode in lasting[lasting.imag >= 0.0]:
         vectors = scipy.linalg.null_space((a - mode * e).conj().T, rcond=RANK_TOLERANCE)
-        undriven = scipy.linalg.null_space((vectors.conj().T @ noise).conj().T, rcond=RANK_TOLERANCE)
-        undriven = undriven if noise.shape[1] else np.eye(vectors.shape[1])
-        columns += [(vectors @ undriven).real, (vectors @ undriven).imag]
+        # Older releases of SciPy take no matrix without rows or columns.
+        if vectors.shape[1] and noise.shape[1]:
+            vectors = vectors @ scipy.linalg.null_space(noise.T @ vectors, rcond=RANK_TOLERANCE)
+        columns += [vectors.real, vectors.imag] if vectors.shape[1] else []
+    if not columns:
+        return np.zeros((len(a), 0))
     return np.asarray(scipy.linalg.orth(np.hstack(columns), rcond=RANK_TOLERANCE))
