@@ -13,16 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.campaigns._changed_proofs import as_data, checker
+from test_proof_files import SAMPLED, SMALL
 
 import obsynth
 from obsynth.exporting.proof_file import proof_bytes, proof_of
 
-A = np.array([[0.9, 0.1, 0.0], [-0.2, 0.7, 0.1], [0.0, 0.3, 0.6]])
-PLANT = obsynth.DescriptorSystem(
-    None, A, [[0.0], [1.0], [0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], Bf=[[0.0], [1.0], [0.0]],
-    Bd=[[0.1], [0.0], [0.2]], dt=0.1,
-)  # fmt: skip
-QUIET = PLANT.replace(Bd=None, Dd=None, disturbance_names=None)
 TEST = {
     "noise_bound": {"y1": 0.1, "y2": 0.1},
     "disturbance_bounds": {"d1": 0.05},
@@ -31,15 +26,15 @@ TEST = {
     "before": 4,
 }
 DESIGNS: dict[str, tuple[obsynth.DescriptorSystem, str, dict[str, Any]]] = {
-    "filter": (PLANT, "fault-estimation-filter", {}),
+    "filter": (SAMPLED, "fault-estimation-filter", {}),
     "functional": (
-        QUIET.replace(Bw=0.1 * np.eye(3, 5), Dw=0.2 * np.eye(2, 5, 3), noise_names=None),
+        SMALL.replace(Bw=0.1 * np.eye(3, 5), Dw=0.2 * np.eye(2, 5, 3), noise_names=None),
         "functional-filter",
         {},
     ),
-    "test": (PLANT, "guaranteed-test", TEST),
+    "test": (SAMPLED, "guaranteed-test", TEST),
     "two faults": (
-        PLANT.replace(Bf=[[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], Df=[[0.0, 1.0], [0.0, 0.0]], fault_names=["f1", "f2"]),
+        SAMPLED.replace(Bf=[[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], Df=[[0.0, 1.0], [0.0, 0.0]], fault_names=["f1", "f2"]),
         "guaranteed-test",
         {**TEST, "fault": "f1", "course": "constant", "before": 0},
     ),

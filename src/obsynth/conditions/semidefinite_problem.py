@@ -60,7 +60,7 @@ class SemidefiniteProblem(cvxpy.Problem):  # type: ignore[misc]
         named = args or any(name in options for name in CHOICES)
         if named or "CLARABEL" not in cvxpy.installed_solvers():
             return super().solve(*args, **options)
-        if not options and self._make_smaller is not None and self._solved_as_smaller():
+        if not options and self._smaller is not None and self._solved_as(self._smaller):
             return self.value
         try:
             return super().solve(solver="CLARABEL", **options)
@@ -69,18 +69,17 @@ class SemidefiniteProblem(cvxpy.Problem):  # type: ignore[misc]
             return super().solve(**options)
 
     @cached_property
-    def _smaller(self) -> SmallerProblem:
-        assert self._make_smaller is not None
-        return self._make_smaller()
+    def _smaller(self) -> SmallerProblem | None:
+        return None if self._make_smaller is None else self._make_smaller()
 
-    def _solved_as_smaller(self) -> bool:
+    def _solved_as(self, smaller: SmallerProblem) -> bool:
         """Solve the smaller problem; return whether its solution is one of this problem, which then has its values."""
-        inner = self._smaller.problem
+        inner = smaller.problem
         try:
             inner.solve(solver="CLARABEL", **SETTINGS_OF_SMALLER)
             if inner.status not in (cvxpy.OPTIMAL, cvxpy.OPTIMAL_INACCURATE):
                 return False
-            self._smaller.set_values()
+            smaller.set_values()
         except (cvxpy.SolverError, np.linalg.LinAlgError):
             return False
         values = [variable.value for variable in self.variables()]

@@ -35,7 +35,7 @@ from obsynth.conditions.problem import Conditions, Values, design_of, require_da
 from obsynth.conditions.wang_over_region import wang_over_region
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
+from obsynth.numerics.arrays import FloatArray, as_matrix, identity_missed, require_no_overflow
 from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, normalise, null_basis
 from obsynth.numerics.invariant_zeros import is_outside
@@ -296,7 +296,7 @@ def _left_inverse(W: Any, Upsilon: FloatArray) -> FloatArray:
 
 
 def _require_identity(name: str, product: FloatArray, size: FloatArray) -> None:
-    miss = float(np.max(np.abs(product - np.eye(len(product))) / np.maximum(size, 1.0), initial=0.0))
+    miss = identity_missed(product, size)
     if not miss <= RANK_TOLERANCE:
         raise SpecError(f"{name} misses the identity by {miss:.3g}: give all digits.", path=name.split()[0])
 

@@ -129,6 +129,11 @@ def require_readable(entries: float) -> None:
         raise ValueError(f"it is too large ({entries:.1e} entries)")
 
 
+def identity_missed(product: FloatArray, size: FloatArray) -> float:
+    """Return by how much a product misses the identity, beside the sizes ``(n, n)`` of its terms."""
+    return float(np.max(np.abs(product - np.eye(len(product))) / np.maximum(size, 1.0), initial=0.0))
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
     raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")

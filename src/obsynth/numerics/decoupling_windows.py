@@ -26,7 +26,7 @@ from scipy.linalg import block_diag
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE
-from obsynth.numerics.standard_form import cayley_point, reachable_basis, standard_form
+from obsynth.numerics.standard_form import cayley, cayley_point, reachable_basis, standard_form
 from obsynth.numerics.unseen_inputs import seen_part
 
 #: Most windows that suffice are this short: longer ones are looked for by doubling.
@@ -338,8 +338,7 @@ def _with_reference(core: _Core, reference: Model, alpha: float | None, newest: 
     a, b, c, d = reference
     k = len(a)
     if alpha is not None:
-        inverse, root = np.linalg.inv(alpha * np.eye(k) - a), np.sqrt(2.0 * alpha)
-        a, b, c, d = inverse @ (alpha * np.eye(k) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+        a, b, c, d = cayley(a, b, c, d, alpha)
     A, B, C, D, L, D1, G, V, F = core
     n = len(A)
     if newest is None:

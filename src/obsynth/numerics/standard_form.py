@@ -82,7 +82,7 @@ def standard_form(
     """
     if dt == 0.0:
         point = cayley_point(scipy.linalg.eigvals(a, e)) if alpha is None else alpha
-        system, shift = _cayley(e, a, b, c, d, point), 0
+        system, shift = _cayley_of_descriptor(e, a, b, c, d, point), 0
     else:
         point, (system, shift) = 1.0, _without_infinite_modes(e, a, b, c, d)
     A, B, C, D = system
@@ -92,13 +92,22 @@ def standard_form(
     return StandardForm(observable.T @ A @ observable, observable.T @ B, C @ observable, D, shift, point)
 
 
-def _cayley(
+def _cayley_of_descriptor(
     e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, alpha: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     factor, root = scipy.linalg.lu_factor(alpha * e - a), np.sqrt(2.0 * alpha)
     moved_b = scipy.linalg.lu_solve(factor, b)
     moved = scipy.linalg.lu_solve(factor, alpha * e + a)
     return moved, root * moved_b, root * (c @ scipy.linalg.lu_solve(factor, e)), d + c @ moved_b
+
+
+def cayley(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, alpha: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the Cayley transform of a continuous-time system, which has its norm; alpha is no pole of it."""
+    identity = np.eye(len(a))
+    inverse, root = np.linalg.inv(alpha * identity - a), np.sqrt(2.0 * alpha)
+    return inverse @ (alpha * identity + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
 
 
 def uncayley(

@@ -115,8 +115,7 @@ def filter_by_inequality(
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
         made = replace(made, observer=averaged(made.observer, method.mean), certificate=Certificate(matrices, claims))
-    taken = "free" if free else "paper" if method.given_weight is None else method.given_weight.tolist()
-    return _recorded(made, method, problem, runs, where, weight=taken)
+    return _recorded(made, method, problem, runs, where, weight=method.taken_weight(free=free))
 
 
 def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:

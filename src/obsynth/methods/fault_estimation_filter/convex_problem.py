@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
 from obsynth.errors import InfeasibleError, SpecError
 from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, identity_missed
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit, null_basis
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
@@ -95,15 +95,15 @@ def left_inverse_near(weight: FloatArray, upsilon: FloatArray, path: str) -> Flo
         The weight has another shape, or ``W Upsilon`` is not the identity.
     """
     require_shape(weight.shape, upsilon.T.shape, path)
-    missed = np.eye(upsilon.shape[1]) - weight @ upsilon
-    share = float(np.max(np.abs(missed) / np.maximum(np.abs(weight) @ np.abs(upsilon), 1.0), initial=0.0))
+    product = weight @ upsilon
+    share = identity_missed(product, np.abs(weight) @ np.abs(upsilon))
     if not share <= RANK_TOLERANCE:
         raise SpecError(
             f"{path}: W Upsilon misses the identity by {share:.3g}: give a left inverse of Upsilon in all its digits. "
             f"With the T of this design Upsilon is {np.round(upsilon, 6).tolist()}.",
             path=path,
         )
-    return np.asarray(weight + missed @ _left_inverse(upsilon))
+    return np.asarray(weight + (np.eye(len(product)) - product) @ _left_inverse(upsilon))
 
 
 def centred(

@@ -222,6 +222,12 @@ class FaultEstimationFilter(Method):
         """The matrix W ``(nf, ny)`` that is given, if one is."""
         return None if self.weight is None or isinstance(self.weight, str) else as_matrix(self.weight, "weight")
 
+    def taken_weight(self, *, free: bool) -> str | list[list[float]]:
+        """Return the option ``weight`` as it was taken: "free", "paper", or the matrix that is given."""
+        if free:
+            return "free"
+        return "paper" if self.given_weight is None else self.given_weight.tolist()
+
     @property
     def own_inequality(self) -> bool:
         """Whether (45) is asked for with something else in it."""

@@ -202,8 +202,7 @@ def _synthesised(
         claims = {"gamma": level, "gamma_min": least["gamma_min"]} | claims | least
         witnesses |= proof
     records = [*outcome.least.records, *outcome.records]
-    taken = "free" if free else "paper" if method.given_weight is None else method.given_weight.tolist()
-    resolved = method.as_plain() | {"weight": taken, "S": None if s is None else s.tolist()}
+    resolved = method.as_plain() | {"weight": method.taken_weight(free=free), "S": None if s is None else s.tolist()}
     if other is not None:
         both = {free: price_in_words(level, gains, observer), not free: other}
         remarks = (*remarks, f"{_PRICES} Free W: {both[True]}. The paper's W: {both[False]}.")

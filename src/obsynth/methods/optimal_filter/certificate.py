@@ -15,7 +15,7 @@ from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
-from obsynth.numerics.standard_form import INFINITE_EIGENVALUE
+from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
@@ -96,8 +96,7 @@ def gain_matrix(channel: ErrorChannel, level: float, dt: float, alpha: float) ->
     channel = channel.in_units_of(level)
     (a, b, c, d), own = channel.middle, level / channel.unit
     if dt == 0.0:
-        inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
-        a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+        a, b, c, d = cayley(a, b, c, d, alpha)
     for scale, size in ((np.ones(len(a)), float(np.linalg.norm(c)) ** 2), (_reached_sizes(a, b), own**2)):
         for share in SLACKS:
             slack = share * size + float(np.finfo(float).tiny)

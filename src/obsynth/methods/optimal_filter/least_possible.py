@@ -23,6 +23,7 @@ from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.standard_form import cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -228,8 +229,7 @@ def _gain(system: Model, dt: float) -> float:
         return 0.0
     if dt == 0.0 and len(a):
         alpha = float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
-        inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
-        a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+        a, b, c, d = cayley(a, b, c, d, alpha)
     return float(hinf_norm(a, b, c, d).upper)
 
 

@@ -33,7 +33,7 @@ from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.standard_form import uncayley
+from obsynth.numerics.standard_form import cayley, uncayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -172,9 +172,7 @@ def _recomputed_gain(plant: DescriptorSystem, chosen: Designed, observer: Linear
     channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
     a, b, c, d = channel.middle
     if not plant.is_discrete:
-        alpha = chosen.problem.alpha
-        inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
-        a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+        a, b, c, d = cayley(a, b, c, d, chosen.problem.alpha)
     return float(hinf_norm(a, b, c, d).upper)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.guaranteed_test.programs import SOLVED_STATUS
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.monitoring.alarms.multipliers import refuted, rows_of_test, statement_of
@@ -33,9 +34,6 @@ CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certific
 
 #: Algorithms of HiGHS, and how long each may take: the simplex method alone may go in circles for ever.
 ALGORITHMS, SOLVER_SECONDS = ("highs-ipm", "highs"), 60.0
-
-#: Status of `scipy.optimize.linprog` where it has an answer.
-SOLVED_STATUS = 0
 
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
 MULTIPLIER_DIGITS = 12

@@ -92,13 +92,13 @@ def health() -> Callable[[int], None]:
     begun = monotonic()
     next_time = begun
 
-    def observation(rows: int) -> None:
+    def report_rows(rows: int) -> None:
         nonlocal next_time
         if monotonic() >= next_time:
             next_time = monotonic() + HEALTH_SECONDS
             print(f"{rows} rows in {monotonic() - begun:.0f} s.", file=sys.stderr, flush=True)
 
-    return observation
+    return report_rows
 
 
 def stated_delay(options: argparse.Namespace) -> int | None:
