@@ -13,6 +13,7 @@ Beyond the paper: W may be any left inverse of Upsilon, or a variable; feedthrou
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -135,100 +136,190 @@ def wang2015(
             raise SpecError("Over a region there are gamma and margin: leave S, T, N, W and coordinates out.", path="W")
         return wang_over_region(plant, gamma=gamma, margin=margin)
     own = linear_plant(plant).dense()
-    conditions, _ = examine_fault_filter(own)
-    require_data(conditions, solvers=("fault zeros",))
-    work = with_sensor_faults_as_states(own)
-    A, C, F, D = work.A, work.C, work.Bf, work.Bd
-    n, m, q = work.nx, work.ny, work.nf
+    existence, _ = examine_fault_filter(own)
+    require_data(existence, solvers=("fault zeros",))
+    data = _paper_data(own, S, T, N, W)
+    convex = data.gain_problem(free_weight=isinstance(W, str))
+    chosen(coordinates, "coordinates", ("plant", "balanced"))
+    written = _balanced_form(data, convex) if coordinates == "balanced" else _plant_form(data)
 
-    T, N = _restricted_equivalent(own, work, S, T, N)  # (7), (16)-(17)
-    TA, TF = T @ A, T @ F
-    Psi = _psi(own, TA, C, TF)  # (20)
-    Upsilon = C @ Psi
-    free = isinstance(W, str)
-    W0 = _left_inverse(W, Upsilon)  # (47)
-    V = null_basis(Upsilon.T)
-    L0 = TA @ Psi @ W0
-    unweighted = np.eye(m) - Upsilon @ W0  # I - Upsilon Upsilon^+
-    A1, C1 = TA - L0 @ C, unweighted @ C  # (46)
-    shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
-    TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, unweighted @ shown_d
-    convex = GainProblem(
-        A=A1,
-        C=V.T @ C,
-        Z=W0 @ C,
-        B=TD,
-        D=V.T @ shown_d,
-        Zd=W0 @ shown_d,
-        Bn=np.zeros((n, m - q)),
-        Dn=-np.eye(m - q),
-        Zn=np.zeros((q, m - q)),
-        free_weight=free,
-    )
-    X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
-    if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":
-        start = search_least_gain(convex)
-        normalised = normalise(convex, start=start.injection, gain=start.gain or None)
-        X, unweighted, unit = normalised.states, normalised.measurements @ V.T, normalised.gain or 1.0
-        R0 = start.injection.R @ V.T
-        A1 = np.asarray(np.linalg.solve(X, (A1 - R0 @ C) @ X))
-        TD = np.asarray(np.linalg.solve(X, TD - R0 @ shown_d) / unit)
-        C1, D1 = unweighted @ C @ X, unweighted @ shown_d / unit
-
-    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(unweighted)), name="Y")
-    variables: dict[str, Any] = {"P": P, "Y": Y}
-    if gamma is None:
-        gamma_squared = variables["gamma_squared"] = cp.Variable(nonneg=True, name="gamma_squared")
-        goal = cp.Minimize(gamma_squared)
-    else:
-        level = real_number(gamma, "gamma", "a positive number", above=0.0)
-        require_no_overflow(level, "gamma", "gamma")
-        gamma_squared = cp.Parameter(nonneg=True, value=level**2, name="gamma_squared")
-        goal = cp.Minimize(0)
-    if free:
-        Vw = variables["Vw"] = cp.Variable((q, m - q), name="Vw") if m > q else np.zeros((q, 0))
-        if m == q:
-            del variables["Vw"]
-        Wx = W0 + Vw @ V.T  # every left inverse of Upsilon
-        Z, Zd = Wx @ (C @ X), Wx @ (shown_d / unit)
-    else:
-        Z, Zd = W0 @ C @ X, W0 @ shown_d / unit
-    driven = P @ A1 - Y @ C1, P @ TD - Y @ D1
-    inequality = _matrix_45(P, gamma_squared / unit**2, driven, Z, Zd, free=free)
-    constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(inequality, -margin)}
-    if not all(condition.holds for condition in conditions) and _hides_a_mode(A1, np.vstack([C1, W0 @ C @ X])):
+    n, q, m = len(data.A1), *data.W.shape
+    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(written.C1)), name="Y")
+    gamma_squared = _gamma_squared(gamma)
+    variables: dict[str, Any] = {"P": P, "Y": Y} | ({"gamma_squared": gamma_squared} if gamma is None else {})
+    weight: Any = data.W
+    if convex.free_weight:  # every left inverse of Upsilon
+        Vw = cp.Variable((q, m - q), name="Vw") if m > q else np.zeros((q, 0))
+        variables |= {"Vw": Vw} if m > q else {}
+        weight = data.W + Vw @ data.V.T
+    constraints = _constraints_45(data, written, (P, Y, gamma_squared), weight, margin, free=convex.free_weight)
+    every_condition_holds = all(condition.holds for condition in existence)
+    if not every_condition_holds and _hides_a_mode(written.A1, np.vstack([written.C1, data.W @ data.C @ written.X])):
         # A P that is nothing in a mode that no gain moves would be within the tolerance of any solver.
-        own, stable = atoms.some_gain_stabilises(A1, 1.0, C1)
-        constraints |= {"Q": own, "some gain is stable": stable}
+        positive, stable = atoms.some_gain_stabilises(written.A1, 1.0, written.C1)
+        constraints |= {"Q": positive, "some gain is stable": stable}
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        R = R0 + X @ np.linalg.solve(values["P"], values["Y"]) @ unweighted  # (63)
-        weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
-        return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
-
-    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD}
-    data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": unweighted}
+        R = written.R0 + written.X @ np.linalg.solve(values["P"], values["Y"]) @ written.innovation_rows  # (63)
+        W_free = data.W + values["Vw"] @ data.V.T if "Vw" in values else data.W
+        L = data.L0 + R  # (60)
+        return {"T": data.T, "N": data.N, "L": L, "W": W_free, "Psi": data.Psi, "Upsilon": data.Upsilon, "R": R}
 
     def without_gain() -> SmallerProblem:
         from obsynth.conditions.wang_without_gain import WrittenIn, wang_without_gain
 
         level = None if gamma is None else gamma_squared
-        return wang_without_gain(convex, variables, level, WrittenIn(X, R0, unweighted, V))
+        form = WrittenIn(written.X, written.R0, written.innovation_rows, data.V)
+        return wang_without_gain(convex, variables, level, form)
 
+    goal = cp.Minimize(gamma_squared if gamma is None else 0)
     # A margin of the user's is one of these coordinates, and without a filter there are no others.
-    smaller = without_gain if margin == MARGIN and all(condition.holds for condition in conditions) else None
+    smaller = without_gain if margin == MARGIN and every_condition_holds else None
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
         lmi.semidefinite_problem(goal, list(constraints.values()), smaller=smaller),
         variables,
         {} if gamma is None else {"gamma_squared": gamma_squared},
-        data,
+        _named_data(data, written),
         constraints,
-        partial(_existence, conditions, convex, gamma),
+        partial(_existence, existence, convex, gamma),
         gains,
         design_of("wang2015", plant, convex),
-        weight=Wx if free else None,
+        weight=weight if convex.free_weight else None,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _PaperData:
+    """The data of (45), in the plant's states; L0 is that of (60) without R, V a basis of ``V' Upsilon = 0``."""
+
+    T: FloatArray
+    N: FloatArray
+    Psi: FloatArray
+    Upsilon: FloatArray
+    W: FloatArray
+    V: FloatArray
+    L0: FloatArray
+    C: FloatArray
+    A1: FloatArray
+    C1: FloatArray
+    TD: FloatArray
+    innovation_d: FloatArray  # (I - C N) Dd: zero in the paper, as D1 and W innovation_d
+    unweighted: FloatArray  # I - Upsilon W
+
+    def gain_problem(self, *, free_weight: bool) -> GainProblem:
+        """Return the filter's error with R as an injection from ``V' y``."""
+        n, (m, q) = len(self.A1), self.Upsilon.shape
+        return GainProblem(
+            A=self.A1,
+            C=self.V.T @ self.C,
+            Z=self.W @ self.C,
+            B=self.TD,
+            D=self.V.T @ self.innovation_d,
+            Zd=self.W @ self.innovation_d,
+            Bn=np.zeros((n, m - q)),
+            Dn=-np.eye(m - q),
+            Zn=np.zeros((q, m - q)),
+            free_weight=free_weight,
+        )
+
+
+def _paper_data(plant: DescriptorSystem, S: Any, T: Any, N: Any, W: Any) -> _PaperData:
+    """Return the data of (45) from the paper's (7), (16)-(20) and (46)-(47)."""
+    work = with_sensor_faults_as_states(plant)
+    A, C, F, D = work.A, work.C, work.Bf, work.Bd
+    T, N = _restricted_equivalent(plant, work, S, T, N)  # (7), (16)-(17)
+    TA, TF = T @ A, T @ F
+    Psi = _psi(plant, TA, C, TF)  # (20)
+    Upsilon = C @ Psi
+    W0 = _left_inverse(W, Upsilon)  # (47)
+    L0 = TA @ Psi @ W0
+    unweighted = np.eye(work.ny) - Upsilon @ W0  # I - Upsilon Upsilon^+
+    innovation_d = (np.eye(work.ny) - C @ N) @ work.Dd
+    return _PaperData(
+        T=T,
+        N=N,
+        Psi=Psi,
+        Upsilon=Upsilon,
+        W=W0,
+        V=null_basis(Upsilon.T),
+        L0=L0,
+        C=C,
+        A1=TA - L0 @ C,  # (46)
+        C1=unweighted @ C,  # (46)
+        TD=T @ D - TA @ (N @ work.Dd) - L0 @ innovation_d,
+        innovation_d=innovation_d,
+        unweighted=unweighted,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _WrittenForm:
+    """The data of (45) for the error ``X xi`` and gain ``R = R0 + X P^-1 Y innovation_rows``, w in units ``unit``."""
+
+    X: FloatArray
+    R0: FloatArray
+    innovation_rows: FloatArray
+    unit: float
+    A1: FloatArray
+    C1: FloatArray
+    TD: FloatArray
+    D1: FloatArray
+
+
+def _plant_form(data: _PaperData) -> _WrittenForm:
+    """Return the data as the paper writes them."""
+    X, R0 = as_matrix(np.eye(len(data.A1)), "X"), np.zeros_like(data.L0)
+    D1 = data.unweighted @ data.innovation_d
+    return _WrittenForm(X, R0, data.unweighted, 1.0, data.A1, data.C1, data.TD, D1)
+
+
+def _balanced_form(data: _PaperData, convex: GainProblem) -> _WrittenForm:
+    """Return the data in the coordinates of a Riccati filter, R counted from its gain, w in units of its level."""
+    start = search_least_gain(convex)
+    normalised = normalise(convex, start=start.injection, gain=start.gain or None)
+    X, rows, unit = normalised.states, normalised.measurements @ data.V.T, normalised.gain or 1.0
+    R0 = start.injection.R @ data.V.T
+    return _WrittenForm(
+        X,
+        R0,
+        rows,
+        unit,
+        A1=np.asarray(np.linalg.solve(X, (data.A1 - R0 @ data.C) @ X)),
+        C1=rows @ data.C @ X,
+        TD=np.asarray(np.linalg.solve(X, data.TD - R0 @ data.innovation_d) / unit),
+        D1=rows @ data.innovation_d / unit,
+    )
+
+
+def _named_data(data: _PaperData, written: _WrittenForm) -> dict[str, FloatArray]:
+    """Return the data by the names that `Conditions` lists."""
+    named = {"T": data.T, "N": data.N, "Psi": data.Psi, "Upsilon": data.Upsilon, "W": data.W}
+    named |= {"A1": written.A1, "C1": written.C1, "TD": written.TD, "L0": data.L0, "D1": written.D1}
+    return named | {"X": written.X, "R0": written.R0, "rest": written.innovation_rows}
+
+
+def _gamma_squared(gamma: float | None) -> Any:
+    """Return gamma squared: a variable, or the parameter of a given level."""
+    if gamma is None:
+        return cp.Variable(nonneg=True, name="gamma_squared")
+    level = real_number(gamma, "gamma", "a positive number", above=0.0)
+    require_no_overflow(level, "gamma", "gamma")
+    return cp.Parameter(nonneg=True, value=level**2, name="gamma_squared")
+
+
+def _constraints_45(
+    data: _PaperData, written: _WrittenForm, unknowns: tuple[Any, Any, Any], weight: Any, margin: float, *, free: bool
+) -> dict[str, Any]:
+    """Return P > 0 and (45) in P, Y and gamma squared."""
+    P, Y, gamma_squared = unknowns
+    if free:
+        Z, Zd = weight @ (data.C @ written.X), weight @ (data.innovation_d / written.unit)
+    else:
+        Z, Zd = weight @ data.C @ written.X, weight @ data.innovation_d / written.unit
+    error_blocks = P @ written.A1 - Y @ written.C1, P @ written.TD - Y @ written.D1
+    inequality = _matrix_45(P, gamma_squared / written.unit**2, error_blocks, Z, Zd, free=free)
+    return {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(inequality, -margin)}
 
 
 def _hides_a_mode(A: FloatArray, outputs: FloatArray) -> bool:
@@ -238,7 +329,7 @@ def _hides_a_mode(A: FloatArray, outputs: FloatArray) -> bool:
     return any(not decide_rank(pencil, expected=len(A), tolerance=HIDDEN_MODE_TOLERANCE).full for pencil in pencils)
 
 
-def _matrix_45(P: Any, level: Any, driven: tuple[Any, Any], Z: Any, Zd: Any, *, free: bool) -> Any:
+def _matrix_45(P: Any, level: Any, error_blocks: tuple[Any, Any], Z: Any, Zd: Any, *, free: bool) -> Any:
     """Return the matrix of (45), which is to be negative definite; where the weight is free before its last Schur
     complement."""
     n, nd, q = P.shape[0], Zd.shape[1], Z.shape[0]
@@ -247,11 +338,11 @@ def _matrix_45(P: Any, level: Any, driven: tuple[Any, Any], Z: Any, Zd: Any, *, 
             [
                 [-P],
                 [np.zeros((nd, n)), -level * np.eye(nd)],
-                [*driven, -P],
+                [*error_blocks, -P],
                 [Z, Zd, np.zeros((q, n)), -np.eye(q)],
             ]
         )
-    return lmi.symmetric_blocks([[-P + Z.T @ Z], [Zd.T @ Z, -level * np.eye(nd) + Zd.T @ Zd], [*driven, -P]])
+    return lmi.symmetric_blocks([[-P + Z.T @ Z], [Zd.T @ Z, -level * np.eye(nd) + Zd.T @ Zd], [*error_blocks, -P]])
 
 
 def _restricted_equivalent(
