@@ -111,22 +111,14 @@ def steady_gain(
     design: Callable[[dict[str, FloatArray], str], ObserverDesign],
 ) -> Conditions:
     """Return the inequalities of a plant without unknown inputs, constant matrices, with its covariances."""
-    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
-    ne, n = E.shape
-
-    H = np.vstack([E, C])
-    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, n:].T
-    L0, K0, N1, N2 = inverse[:, :ne], inverse[:, ne:], null[:, :ne], null[:, ne:]
-    W, V = covariance_factor(process, "Q"), covariance_factor(sensor, "R")
-    nw, m = W.shape[1] + V.shape[1], len(null)
-
-    X = _coordinates(varying, process, sensor)
-    LA, N1A = np.linalg.solve(X, L0 @ A @ X), N1 @ A @ X
+    data = _gain_data(varying, process, sensor)
+    A, L0, K0, N1, N2, W, V, X = (data[letter] for letter in ("A", "L0", "K0", "N1", "N2", "W", "V", "X"))
+    n, nw = len(X), W.shape[1] + V.shape[1]
 
     P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
-    Y = cp.Variable((n, m), name="Y")
+    Y = cp.Variable((n, len(N1)), name="Y")
     stable, covariance = atoms.h2(
-        LA,
+        data["LA"],
         np.linalg.solve(X, np.hstack([L0 @ W, -K0 @ V])),
         X,
         np.zeros((n, nw)),
@@ -134,7 +126,7 @@ def steady_gain(
         Z,
         varying.dt,
         Y=Y,
-        Cy=-N1A,
+        Cy=-data["N1A"],
         Dy=np.hstack([-N1 @ W, N2 @ V]),
         detectable=True,
         margin=margin,
@@ -147,22 +139,6 @@ def steady_gain(
         driven = np.hstack([L @ W, -K @ V])
         return {"L": L, "K": K, "covariance": output_covariance(L @ A, driven, np.eye(n), np.zeros((n, nw)))}
 
-    data = {
-        "E": E,
-        "A": A,
-        "C": C,
-        "L0": L0,
-        "K0": K0,
-        "N1": N1,
-        "N2": N2,
-        "LA": LA,
-        "N1A": N1A,
-        "X": X,
-        "Q": process,
-        "R": sensor,
-        "W": W,
-        "V": V,
-    }
     return Conditions(
         "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
         lmi.semidefinite_problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
@@ -174,6 +150,19 @@ def steady_gain(
         gains,
         design,
     )
+
+
+def _gain_data(varying: TimeVaryingDescriptorSystem, process: FloatArray, sensor: FloatArray) -> dict[str, FloatArray]:
+    """Return the data of the inequalities: all ``[L K]`` with (12), and the error system in coordinates X."""
+    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
+    ne, n = E.shape
+    H = np.vstack([E, C])
+    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, n:].T
+    L0, K0, N1, N2 = inverse[:, :ne], inverse[:, ne:], null[:, :ne], null[:, ne:]
+    X = _coordinates(varying, process, sensor)
+    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2}
+    data |= {"LA": np.linalg.solve(X, L0 @ A @ X), "N1A": N1 @ A @ X, "X": X, "Q": process, "R": sensor}
+    return data | {"W": covariance_factor(process, "Q"), "V": covariance_factor(sensor, "R")}
 
 
 def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray]:

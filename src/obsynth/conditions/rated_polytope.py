@@ -1,20 +1,23 @@
-r"""Observers of polytopic plants whose parameter moves slowly, in continuous time: a Lyapunov matrix that moves along.
+r"""Observers of polytopic plants whose parameter has a bounded rate: inequalities with a Lyapunov matrix P(t) of it.
 
-Two vertices, a weight t of the second one with ``|t'| <= nu``, and P(t), Y(t) in Bernstein form; ``L = P^-1 Y``:
+In continuous time, with two vertices: t in [0, 1] is the weight of the second one and changes by at most nu a second.
+P(t), and Y(t) of the gain ``L(t) = P(t)^-1 Y(t)``, are polynomials in t in Bernstein form.  For all t, and both signs,
 
 .. math::
     \begin{bmatrix} \mathrm{He}(P A - Y C) \pm \nu P' & P B - Y D & C_z^T \\ * & -\gamma^2 I & D_z^T \\ * & * & -I
     \end{bmatrix} < 0, \qquad P > 0 \tag{V6}
 
-The coefficients on equal pieces of [0, 1] are negative definite (`obsynth.numerics.bernstein`), or with ``2 a P`` in
-the first place and without w and z for a decay.  Gains that are given stand for Y: ``P (A - L C)``, L linear in t.
+gives errors whose L2 gain from w to z is at most gamma.  For a decay ``exp(-a time)`` the first block has ``2 a P``
+besides, and the rows of w and z are left out.  The polynomial in t is negative definite on [0, 1] where all its
+Bernstein coefficients on equal pieces of [0, 1] are (`obsynth.numerics.bernstein`).  Where gains are given, L linear in
+t, ``P (A - L C)`` takes the place of ``P A - Y C``.
 
 Reference: Wu, Yang, Packard, Becker, Int. J. Robust Nonlinear Control 6 (1996).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +56,7 @@ def rated_inequalities(
     errors : ErrorPolytope
         Two vertices, in continuous time, without algebraic errors; C and D constant unless gains are given.
     rate : float
-        Largest change of the weight of the second vertex in a second.
+        Largest rate of the weight of the second vertex, in 1/s: the weight moves between 0 and 1.
     goal : {"gain", "decay"}, optional
         The least L2 gain from w to z, or the largest slack of ``decay``.
     level : float, optional
@@ -84,47 +87,32 @@ def rated_inequalities(
 
     Examples
     --------
-    The commutator of a gain with the unit lag: 1 for any course, about the rate for slow ones.
+    The commutator of a gain with the unit lag: L2 gain 1 for any motion of the gain, about the rate for slow ones.
 
     >>> import numpy as np
     >>> errors = ErrorPolytope(
     ...     [-np.eye(2)] * 2, np.zeros((0, 2)), B=[[[1.0], [-1]], [[1.0], [1]]], Cz=[[[-1.0, -1]], [[1.0, -1]]], dt=0.0
     ... )
-    >>> found = rated_inequalities(errors, 0.1, degree=1, pieces=4)
-    >>> found.solve("CLARABEL", {})
-    >>> 0.2 < float(found.variables["gamma_squared"].value) ** 0.5 < 0.8
+    >>> conditions = rated_inequalities(errors, 0.1, degree=1, pieces=4)
+    >>> conditions.solve("CLARABEL", {})
+    >>> 0.2 < float(conditions.variables["gamma_squared"].value) ** 0.5 < 0.8
     True
     """
     chosen(goal, "goal", ("gain", "decay"))
     _require_fitting(errors, rate, level, decay, gains)
-    n, m, p = errors.order, errors.outputs, errors.inputs
-    q = len(errors.Cz[0])
+    n, m = errors.order, errors.outputs
     P = [cp.Variable((n, n), symmetric=True, name=f"P[{k + 1}]") for k in range(degree + 1)]
-    given = None if gains is None else [np.asarray(L, np.float64) for L in gains]
-    Y = [cp.Variable((n, m), name=f"Y[{k + 1}]") for k in range(degree + 1)] if given is None else []
+    given_gains = None if gains is None else [np.asarray(L, np.float64) for L in gains]
+    Y = [cp.Variable((n, m), name=f"Y[{k + 1}]") for k in range(degree + 1)] if given_gains is None else []
     room = cp.Variable(name="room") if goal == "decay" or level is not None else None
-    kept: Any = margin if room is None else room
+    slack: Any = margin if room is None else room
     squared = cp.Variable(nonneg=True, name="gamma_squared") if room is None else None
-    value: Any = squared if level is None else level**2
-    closed = None if given is None else [errors.at(unit, given) for unit in np.eye(2)]
-    A, B = (errors.A, errors.B) if closed is None else ([c[0] for c in closed], [c[1] for c in closed])
     constraints: dict[str, Any] = {}
     for place, weights in coefficients_on_pieces(degree, pieces):
-        constraints[f"P, {place}"] = lmi.at_least(_sum(P, weights), kept)
-    for at in product_coefficients(degree, pieces):
-        low, high = _sum(P, at.low), _sum(P, at.high)
-        PA, PB = low @ A[0] + high @ A[1], low @ B[0] + high @ B[1]
-        if Y:
-            moved = _sum(Y, at.low + at.high)
-            PA, PB = PA - moved @ errors.C[0], PB - moved @ errors.D[0]
-        Z, Dz = (at.ends[0] * one[0] + at.ends[1] * one[1] for one in (errors.Cz, errors.Dz))
-        for sign in (-1.0, 1.0) if rate else (1.0,):
-            first = -2.0 * PA - sign * rate * _sum(P, at.slope) - 2.0 * decay * (low + high)
-            lower = [[first]]
-            if goal == "gain":
-                lower = [[first], [-PB.T, at.scale * value * np.eye(p)], [-Z, -Dz, at.scale * np.eye(q)]]
-            name = f"(V6) {'+' if sign > 0.0 else '-'}, {at.place}"
-            constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+        constraints[f"P, {place}"] = lmi.at_least(_sum(P, weights), slack)
+    gamma_squared = squared if level is None else level**2
+    matrices = _coefficients_v6(errors, (P, Y), gamma_squared, given_gains, rate, decay, goal, pieces)
+    constraints |= {name: lmi.at_least(lmi.symmetric_blocks(lower), slack) for name, lower in matrices}
     variables = {each.name(): each for each in (*P, *Y)}
     if room is not None:
         variables["room"] = room
@@ -137,9 +125,9 @@ def rated_inequalities(
         constraints |= {f"limit, {each.name()}": cp.norm(each, "fro") <= gain_limit for each in Y}
 
     def own_gains(_: Values) -> dict[str, FloatArray]:
-        known = {each.name(): 0.5 * (each.value + each.value.T) for each in P}
-        ends = given if given is not None else [np.linalg.solve(known[P[k].name()], Y[k].value) for k in (0, degree)]
-        return known | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(ends)}
+        values = {each.name(): 0.5 * (each.value + each.value.T) for each in P}
+        ends = given_gains or [np.linalg.solve(values[P[k].name()], Y[k].value) for k in (0, degree)]
+        return values | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(ends)}
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
         raise SpecError(f"The error system of {name!r} has no plant: design by a method.", path="errors")
@@ -157,6 +145,36 @@ def rated_inequalities(
         own_gains,
         unsupported,
     )
+
+
+def _coefficients_v6(
+    errors: ErrorPolytope,
+    unknowns: tuple[Sequence[Any], Sequence[Any]],
+    gamma_squared: Any,
+    gains: Sequence[FloatArray] | None,
+    rate: float,
+    decay: float,
+    goal: str,
+    pieces: int,
+) -> Iterator[tuple[str, list[list[Any]]]]:
+    """Yield the Bernstein coefficients of minus the matrix of (V6), by name, as lower blocks."""
+    P, Y = unknowns
+    closed = None if gains is None else [errors.at(vertex, gains) for vertex in np.eye(2)]
+    A, B = (errors.A, errors.B) if closed is None else ([c[0] for c in closed], [c[1] for c in closed])
+    p, q = errors.inputs, len(errors.Cz[0])
+    for at in product_coefficients(len(P) - 1, pieces):
+        low, high = _sum(P, at.low), _sum(P, at.high)
+        PA, PB = low @ A[0] + high @ A[1], low @ B[0] + high @ B[1]
+        if Y:
+            Y_at = _sum(Y, at.low + at.high)
+            PA, PB = PA - Y_at @ errors.C[0], PB - Y_at @ errors.D[0]
+        Z, Dz = (at.ends[0] * matrix[0] + at.ends[1] * matrix[1] for matrix in (errors.Cz, errors.Dz))
+        for sign in (-1.0, 1.0) if rate else (1.0,):
+            first = -2.0 * PA - sign * rate * _sum(P, at.slope) - 2.0 * decay * (low + high)
+            lower = [[first]]
+            if goal == "gain":
+                lower = [[first], [-PB.T, at.scale * gamma_squared * np.eye(p)], [-Z, -Dz, at.scale * np.eye(q)]]
+            yield f"(V6) {'+' if sign > 0.0 else '-'}, {at.place}", lower
 
 
 def _require_fitting(errors: ErrorPolytope, rate: float, level: Any, decay: Any, gains: Any) -> None:

@@ -17,6 +17,7 @@ a U of full rank, unless E_sharp, C_sharp and G of (10), (11) are given; several
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -166,33 +167,14 @@ def augmented_problem(
     # Outputs that show d directly are solved for it; the others are left for the gain.
     undisturbed, injection, _ = direct_part(plant)
     injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
-    UA, own_c = U_a @ (augmented.A - injected @ augmented.C), undisturbed @ augmented.C
-    na, m = augmented.order, len(own_c)
-    stable = disk(0.0, 1.0) if plant.is_discrete else half_plane(0.0)
-    where = stable if region is None else stable & checked_region(region)
-
-    P = cp.Variable((na, na), symmetric=True, name="P")
-    constraints = {"P": lmi.at_least(P, 1.0)}  # the inequalities leave the scale free
+    UA, C_gain = U_a @ (augmented.A - injected @ augmented.C), undisturbed @ augmented.C
     if poles is None:
-        X = _coordinates(UA, own_c, where, discrete=plant.is_discrete) if X is None else X
-        UAx, Cx = np.linalg.solve(X, UA @ X), own_c @ X
-        Y = cp.Variable((na, m), name="Y")
-        # As P >= I, the first is no less than the norm of K_a; the second makes the optimum one that solvers agree on.
-        variables, goal = {"P": P, "Y": Y}, cp.norm(Y, "fro") + cp.trace(P)
-        constraints["stability"] = atoms.region(UAx, P, stable, Y=Y, Cy=Cx, margin=margin)[1]
-        if region is not None:
-            constraints["region"] = atoms.region(UAx, P, region, Y=Y, Cy=Cx, margin=margin)[1]
+        inequality = _region_inequality(UA, C_gain, region, X, discrete=plant.is_discrete, margin=margin)
     else:
-        targets = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
-        K = place(UA, own_c, targets, dt=plant.dt, objective="gain")[0]
-        contraction = prove_contraction(UA - K @ own_c, discrete=plant.is_discrete)
-        X = np.eye(na) if contraction is None else contraction.inverse
-        variables, goal = {"P": P}, cp.trace(P)
-        closed = np.linalg.solve(X, (UA - K @ own_c) @ X)
-        constraints["stability"] = atoms.region(closed, P, stable, margin=margin)[1]
+        inequality = _placed_inequality(UA, C_gain, poles, plant.dt, margin=margin)
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        free = K if poles is not None else X @ np.linalg.solve(values["P"], values["Y"])
+        free = inequality.gain(values)
         K_a = free @ undisturbed + U_a @ injected
         letters = realise(plant, model, (U_a, D_a, K_a), combinations_seen(plant))[1]
         nx = plant.nx
@@ -206,27 +188,78 @@ def augmented_problem(
         "B_da": augmented.Bd,
         "C_a": augmented.C,
         "UA": UA,
-        "C_seen": own_c,
-        "X": X,
+        "C_seen": C_gain,
+        "X": inequality.X,
         "Phi": model.Phi,
         "Cw": model.Cw,
     }
     return Conditions(
         "Share Pasand, Aliyari, Taghirad, (13), (19), procedure 1",
-        lmi.semidefinite_problem(cp.Minimize(goal), list(constraints.values())),
-        variables,
+        lmi.semidefinite_problem(cp.Minimize(inequality.goal), list(inequality.constraints.values())),
+        inequality.variables,
         {},
         data,
-        constraints,
+        inequality.constraints,
         lambda: conditions,
         gains,
         design,
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _GainInequality:
+    """An inequality in coordinates X for the gain of ``UA - K C``, and the K of a solution."""
+
+    variables: dict[str, Any]
+    goal: Any
+    constraints: dict[str, Any]
+    X: FloatArray
+    gain: Callable[[Values], FloatArray]
+
+
+def _stable_region(*, discrete: bool) -> LMIRegion:
+    return disk(0.0, 1.0) if discrete else half_plane(0.0)
+
+
+def _region_inequality(
+    UA: FloatArray, C: FloatArray, region: LMIRegion | None, X: FloatArray | None, *, discrete: bool, margin: float
+) -> _GainInequality:
+    """Return the inequality of a stable region, and of a given one, in P and ``Y = P K``."""
+    stable = _stable_region(discrete=discrete)
+    where = stable if region is None else stable & checked_region(region)
+    P = cp.Variable((len(UA), len(UA)), symmetric=True, name="P")
+    X = _coordinates(UA, C, where, discrete=discrete) if X is None else X
+    UAx, Cx = np.linalg.solve(X, UA @ X), C @ X
+    Y = cp.Variable((len(UA), len(C)), name="Y")
+    constraints = {"P": lmi.at_least(P, 1.0)}  # the inequalities leave the scale free
+    constraints["stability"] = atoms.region(UAx, P, stable, Y=Y, Cy=Cx, margin=margin)[1]
+    if region is not None:
+        constraints["region"] = atoms.region(UAx, P, region, Y=Y, Cy=Cx, margin=margin)[1]
+    # As P >= I, the first is no less than the norm of K_a; the second makes the optimum one that solvers agree on.
+    goal = cp.norm(Y, "fro") + cp.trace(P)
+    return _GainInequality(
+        {"P": P, "Y": Y}, goal, constraints, X, lambda values: X @ np.linalg.solve(values["P"], values["Y"])
+    )
+
+
+def _placed_inequality(
+    UA: FloatArray, C: FloatArray, poles: Sequence[Any], dt: float, *, margin: float
+) -> _GainInequality:
+    """Return the inequality of stability in P with the gain that places given poles."""
+    n, discrete = len(UA), dt > 0.0
+    P = cp.Variable((n, n), symmetric=True, name="P")
+    targets = checked_poles(poles, n, np.zeros(0, dtype=np.complex128), dt, of="ui-pi-observer")
+    K = place(UA, C, targets, dt=dt, objective="gain")[0]
+    contraction = prove_contraction(UA - K @ C, discrete=discrete)
+    X = np.eye(n) if contraction is None else contraction.inverse
+    closed = np.linalg.solve(X, (UA - K @ C) @ X)
+    constraints = {"P": lmi.at_least(P, 1.0)}
+    constraints["stability"] = atoms.region(closed, P, _stable_region(discrete=discrete), margin=margin)[1]
+    return _GainInequality({"P": P}, cp.trace(P), constraints, X, lambda _: K)
+
+
 def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bool) -> FloatArray:
     """Return a state change ``(n, n)`` in which the errors of a Kalman filter of the region's speed are alike."""
-
     n = len(F)
     reals = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
     if not reals:

@@ -99,28 +99,17 @@ def slope_inequality(
     >>> import numpy as np
     >>> nominal = ErrorPolytope([[[0, 1], [-2.0, -1]]], np.zeros((0, 2)), dt=0.0)
     >>> spring = SlopedErrors(nominal, np.array([[0], [1.0]]), np.zeros((0, 1)), np.array([[1.0, 0]]))
-    >>> found = slope_inequality(spring, goal="decay", decay=0.0)
-    >>> found.solve("CLARABEL", {})
-    >>> bool(found.variables["room"].value > 1e-3)
+    >>> conditions = slope_inequality(spring, goal="decay", decay=0.0)
+    >>> conditions.solve("CLARABEL", {})
+    >>> bool(conditions.variables["room"].value > 1e-3)
     True
     """
-    chosen(goal, "goal", ("gain", "power", "decay"))
-    chosen(multiplier, "multiplier", ("full", "diagonal"))
-    if multiplier == "full" and errors.count > MOST_IN_FULL_MULTIPLIER:
-        raise SpecError(
-            f"A full multiplier for {errors.count} slopes stands at 2 ** {errors.count} corners: take "
-            "multiplier='diagonal'.",
-            path="multiplier",
-        )
-    if decay is not None and not decay >= 0.0:
-        raise SpecError(f"decay is {shown(decay)}: give a rate, 0 or more.", path="decay")
-    if goal == "decay" and decay is None:
-        raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
+    _require_options(errors, goal, multiplier, decay)
     own = errors.nominal
     n, k, m, p = own.order, own.differential or own.order, own.outputs, own.inputs
     P, G = descriptor_variables(n, k)
-    above = cp.Variable((k, m), name="Y")
-    Y = cp.vstack([above, np.zeros((n - k, m))]) if k < n else above
+    Y1 = cp.Variable((k, m), name="Y")
+    Y = cp.vstack([Y1, np.zeros((n - k, m))]) if k < n else Y1
     room = cp.Variable(name="room") if goal == "decay" else None
     slack: Any = margin if room is None else room
     level = cp.Variable(nonneg=True, name="gamma_squared" if goal == "gain" else "mean_square")
@@ -148,7 +137,7 @@ def slope_inequality(
     if room is not None:
         constraints |= {"room": room <= MOST_ROOM, "trace": cp.trace(P) <= TRACE * n}
     objective = cp.Minimize(level) if room is None else cp.Maximize(room)
-    variables = {part.name(): part for part in (*P.variables(), *G.variables(), above)}
+    variables = {part.name(): part for part in (*P.variables(), *G.variables(), Y1)}
     variables |= {"room": room} if room is not None else {level.name(): level}
 
     def gains(_: Values) -> dict[str, FloatArray]:
@@ -169,6 +158,21 @@ def slope_inequality(
         gains,
         unsupported,
     )
+
+
+def _require_options(errors: SlopedErrors, goal: str, multiplier: str, decay: float | None) -> None:
+    chosen(goal, "goal", ("gain", "power", "decay"))
+    chosen(multiplier, "multiplier", ("full", "diagonal"))
+    if multiplier == "full" and errors.count > MOST_IN_FULL_MULTIPLIER:
+        raise SpecError(
+            f"A full multiplier for {errors.count} slopes stands at 2 ** {errors.count} corners: take "
+            "multiplier='diagonal'.",
+            path="multiplier",
+        )
+    if decay is not None and not decay >= 0.0:
+        raise SpecError(f"decay is {shown(decay)}: give a rate, 0 or more.", path="decay")
+    if goal == "decay" and decay is None:
+        raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
 
 
 def _multiplier(q: int, kind: str, name: str) -> tuple[Any, Any, Any, dict[str, Any]]:
