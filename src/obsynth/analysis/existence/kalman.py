@@ -11,7 +11,7 @@ Nothing else is known about d, so nothing is lost.  It exists when ``[N E 0; C D
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,11 +35,10 @@ UNKNOWN_INPUT_PRIOR = 1e4
 
 @dataclass(frozen=True, eq=False)
 class WithoutUnknownInputs:
-    """A plant without unknown inputs."""
+    """A plant whose unknown inputs are states, or removed with equations."""
 
     plant: TimeVaryingDescriptorSystem
     equations: FloatArray  # N (ne, nx)
-    V1: FloatArray  # (nd, n1): the unknown inputs that outputs show directly
     names: tuple[str, ...]  # of the states d1
     scale: FloatArray  # of the prior deviations of d1, (n1,)
     note: str
@@ -77,51 +76,37 @@ class WithoutUnknownInputs:
         return joint
 
 
+@dataclass(frozen=True, eq=False)
+class _ScaledInputs:
+    """Unknown inputs in units in which each has the same effect, with factors that bring the plant near one.
+
+    No unit of the plant then decides what an output shows.
+    """
+
+    Bd: FloatArray
+    Dd: FloatArray
+    equations: FloatArray
+    outputs: FloatArray
+
+
 @remembered
 def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     """Return a plant without its unknown inputs; `SpecError` for what else these methods do not take."""
     nothing = {name: None for name in ("Bd", "Dd", "disturbance_names")}
     known = as_time_varying(plant.replace(**nothing))
-    # In units in which each unknown input has the same effect, and the plant is near one: no unit decides what shows.
-    own = PlantUnits.of(plant).rounded()
-    rows, outputs = own.equations[:, None], own.outputs[:, None]
-    sizes = np.linalg.norm(np.vstack([rows * plant.Bd, outputs * plant.Dd]), axis=0)
-    units = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
-    bd, dd = plant.Bd * units, plant.Dd * units
-    _, values, right = np.linalg.svd(outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
-    rank = numerical_rank(values, scale=1.0)
-    visible, hidden = right[:rank].T, right[rank:].T
-    if rank == plant.nd:
-        visible, names = np.eye(plant.nd), plant.disturbance_names
-    else:
-        names = tuple(f"unknown input {i + 1}" for i in range(rank))
-    # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
-    hidden_effect = rows * bd @ hidden
-    reached = np.flatnonzero(np.any(hidden_effect != 0.0, axis=1))
-    left, sizes_of_entry, _ = np.linalg.svd(hidden_effect[reached])
-    moved = numerical_rank(sizes_of_entry, scale=1.0)
-    if moved == plant.nx:
-        raise SpecError(
-            f"Unknown inputs ({', '.join(plant.disturbance_names)}) drive every equation: none is left to predict the "
-            "state with. State one of them as noise (Bw), or leave it out.",
-            path="Bd",
-        )
-    equations = np.eye(plant.nx)
-    if moved:
-        turned = np.zeros((len(reached) - moved, plant.nx))
-        turned[:, reached] = left[:, moved:].T * own.equations[reached]
-        equations = np.vstack([turned, np.delete(equations, reached, axis=0)])
-    if rank == plant.nd:
-        # In their own units again, with their own names.
-        bd, dd = plant.Bd, plant.Dd
-    through, direct = product_but_rounding(equations, bd) @ visible, dd @ visible
-    scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ visible, axis=0)
-    count = known.nx
+    scaled = _scaled_inputs(plant)
+    names, V1, V2 = _direct_inputs(plant, scaled)
+    equations = _equations_without(plant, scaled, V2)
+    removed = plant.nx - len(equations)
+    # All of them as states: in their own units again, with their own names.
+    Bd, Dd = (plant.Bd, plant.Dd) if len(names) == plant.nd else (scaled.Bd, scaled.Dd)
+    process_d1, direct_d1 = product_but_rounding(equations, Bd) @ V1, Dd @ V1
+    scale = 1.0 / np.linalg.norm(np.vstack([Bd, Dd]) @ V1, axis=0)
     reduced = TimeVaryingDescriptorSystem(
-        np.hstack([product_but_rounding(equations, plant.E), np.zeros((len(equations), rank))]),
-        np.hstack([product_but_rounding(equations, plant.A), through]),
+        np.hstack([product_but_rounding(equations, plant.E), np.zeros((len(equations), len(names)))]),
+        np.hstack([product_but_rounding(equations, plant.A), process_d1]),
         product_but_rounding(equations, plant.B),
-        np.hstack([plant.C, direct]),
+        np.hstack([plant.C, direct_d1]),
         Phi=product_but_rounding(equations, plant.Bf),
         Psi=plant.Df,
         D=plant.D,
@@ -134,15 +119,59 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         scales=known.scales,
         units={**known.units, **{name: plant.units[name] for name in names if name in plant.units}},
     )
+    return WithoutUnknownInputs(reduced, equations, names, scale, _note(plant, names, removed))
+
+
+def _scaled_inputs(plant: DescriptorSystem) -> _ScaledInputs:
+    factors = PlantUnits.of(plant).rounded()
+    equations, outputs = factors.equations[:, None], factors.outputs[:, None]
+    sizes = np.linalg.norm(np.vstack([equations * plant.Bd, outputs * plant.Dd]), axis=0)
+    units = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
+    return _ScaledInputs(plant.Bd * units, plant.Dd * units, equations, outputs)
+
+
+def _direct_inputs(plant: DescriptorSystem, scaled: _ScaledInputs) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Return the names of the unknown inputs that outputs show directly, V1, and V2."""
+    dd = scaled.Dd
+    _, values, right = np.linalg.svd(scaled.outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
+    rank = numerical_rank(values, scale=1.0)
+    if rank == plant.nd:
+        return plant.disturbance_names, np.eye(plant.nd), right[rank:].T
+    return tuple(f"unknown input {i + 1}" for i in range(rank)), right[:rank].T, right[rank:].T
+
+
+def _equations_without(plant: DescriptorSystem, scaled: _ScaledInputs, V2: FloatArray) -> FloatArray:
+    """Return ``N`` with ``N Bd V2 = 0``: the equations that are left."""
+    # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
+    hidden_effect = scaled.equations * scaled.Bd @ V2
+    reached = np.flatnonzero(np.any(hidden_effect != 0.0, axis=1))
+    left, singular_values, _ = np.linalg.svd(hidden_effect[reached])
+    removed = numerical_rank(singular_values, scale=1.0)
+    if removed == plant.nx:
+        raise SpecError(
+            f"Unknown inputs ({', '.join(plant.disturbance_names)}) drive every equation: none is left to predict the "
+            "state with. State one of them as noise (Bw), or leave it out.",
+            path="Bd",
+        )
+    equations = np.eye(plant.nx)
+    if not removed:
+        return equations
+    combined = np.zeros((len(reached) - removed, plant.nx))
+    combined[:, reached] = left[:, removed:].T * scaled.equations[reached, 0]
+    return np.vstack([combined, np.delete(equations, reached, axis=0)])
+
+
+def _note(plant: DescriptorSystem, names: Sequence[str], removed: int) -> str:
+    """Return what becomes of the unknown inputs, in words."""
     parts = []
-    if rank:
-        parts.append(f"{', '.join(map(repr, names))} {'is' if rank == 1 else 'are'} estimated with the states")
-    if moved:
-        parts.append(f"{moved} of {count} equations were removed with the unknown inputs that reach no output directly")
+    if names:
+        parts.append(f"{', '.join(map(repr, names))} {'is' if len(names) == 1 else 'are'} estimated with the states")
+    if removed:
+        parts.append(
+            f"{removed} of {plant.nx} equations were removed with the unknown inputs that reach no output directly"
+        )
     note = f"Nothing is assumed about the unknown inputs {', '.join(map(repr, plant.disturbance_names))}: "
-    return WithoutUnknownInputs(
-        reduced, equations, visible, names, scale, note + ("; ".join(parts) or "they have no effect") + "."
-    )
+    return note + ("; ".join(parts) or "they have no effect") + "."
 
 
 def kalman_conditions(
