@@ -310,6 +310,26 @@ def test_a_contraction_is_found_where_double_precision_loses_it(discrete: bool) 
     assert len(list(proved_contractions(matrix, discrete=discrete, poles=poles))) == len(contraction.TRIED_RATES)
 
 
+@pytest.mark.parametrize(("length", "growth"), [(2, 1e3), (3, 1e2)])
+def test_a_contraction_is_found_though_errors_grow_before_they_decay(length: int, growth: float) -> None:
+    """Solved for the rate itself, the inequality holds by 1e-12 of P: less than its rounding of 2e-10 or more."""
+    rng = np.random.default_rng(0)
+    poles = rng.uniform(0.5, 0.99, 24)
+    coupling = np.where(np.arange(1, 24) % length, growth * rng.uniform(0.5, 1.0, 23), 0.0)
+    turn = np.linalg.qr(rng.standard_normal((24, 24)))[0]
+    matrix = turn @ (np.diag(poles) + np.diag(coupling, 1)) @ turn.T
+    rate = 0.5 + 0.5 * float(np.max(poles))
+    found = contraction.prove_contraction(matrix, discrete=True, rate=rate)
+    assert found is not None
+    assert found.rate == rate
+    # From one norm to the other and back no more is gained than the condition of Q; the errors do grow.
+    powers = [float(np.linalg.norm(np.linalg.matrix_power(matrix, k), 2)) for k in range(0, 400, 20)]
+    condition = float(np.linalg.norm(found.Q, 2) * np.linalg.norm(found.inverse, 2)) / (1.0 - found.defect)
+    assert max(powers) > growth
+    assert all(power <= condition * rate**k for power, k in zip(powers, range(0, 400, 20), strict=True))
+    assert contraction.prove_contraction(matrix, discrete=True, rate=0.9 * float(np.max(poles))) is None
+
+
 def test_poles_that_rounding_moves_are_told() -> None:
     assert rounding_of_eigenvalues(np.diag([-1.0, -2.0])) <= 1e-15
     assert rounding_of_eigenvalues(NEARLY_DEFECTIVE) > KNOWN_POLES

@@ -23,6 +23,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_v
 from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
+from obsynth.numerics.spectra import abscissa
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite
@@ -53,6 +54,11 @@ PRECISE_BITS, PRECISE_SUMS_UP_TO = 1024, 20
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
+
+#: Solved for a rate this far from the spectral radius to the rate asked for, a Lyapunov matrix P satisfies the
+#: inequality by a share of P itself, in every direction; solved for the rate, by an identity matrix, which is lost
+#: beside a large P.
+SHARE_OF_THE_RATE = 0.9
 
 #: What is added to a matrix, as a share of its largest entry, so that it has a positive eigenvector.
 _SHIFTS = (1e-4, 1e-7, 1e-10, 1e-13)
@@ -185,8 +191,9 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
-    factors_of = (_summed_factor, _lyapunov_factor)
-    for factor_of in (*(factors_of if sums_first else factors_of[::-1]), _precise_factor):
+    sums_first_factors = (_summed_factor, _lyapunov_factor, _precise_factor, _faster_lyapunov_factor)
+    equations_first = (_lyapunov_factor, _faster_lyapunov_factor, _summed_factor, _precise_factor)
+    for factor_of in sums_first_factors if sums_first else equations_first:
         factor = factor_of(ball.midpoint, rate, discrete=discrete)
         contraction = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
         if contraction is not None:
@@ -314,6 +321,14 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
         return None
     root = (np.sqrt(values)[:, None] * vectors.T) / scale[None, :]
     return np.asarray(np.triu(qr(root, mode="r")[0][: len(a)]))
+
+
+def _faster_lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
+    """Return the factor for a rate between this one and the fastest that there is."""
+    bound = abscissa(a, 1.0 if discrete else 0.0)
+    bound = bound if discrete else -bound
+    faster = bound + SHARE_OF_THE_RATE * (rate - bound)
+    return _lyapunov_factor(a, faster, discrete=discrete)
 
 
 def _root_of_sum(power: FloatArray) -> FloatArray | None:
