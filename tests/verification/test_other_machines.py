@@ -330,6 +330,27 @@ def test_a_contraction_is_found_though_errors_grow_before_they_decay(length: int
     assert contraction.prove_contraction(matrix, discrete=True, rate=0.9 * float(np.max(poles))) is None
 
 
+@pytest.mark.parametrize("discrete", [False, True])
+def test_filters_that_do_not_touch_contract_beside_each_other(discrete: bool) -> None:
+    rng = np.random.default_rng(3)
+    matrix = 0.04 * rng.standard_normal((102, 102)) - (0.0 if discrete else np.eye(102))
+    owner = rng.integers(0, 3, 102)
+    matrix[owner[:, None] != owner[None, :]] = 0.0
+    found = contraction.prove_contraction(matrix, discrete=discrete)
+    assert found is not None
+    assert np.array_equal(found.Q != 0.0, np.triu(owner[:, None] == owner[None, :]))
+    # The whole norm stands by itself, and its distance from the inverse is within what is stated.
+    assert contraction._proved(Ball.of(matrix), found.Q, found.rate, discrete=discrete) is not None
+    assert np.linalg.norm(found.Q @ found.inverse - np.eye(102), 2) <= found.defect
+    # What may be coupled, by a radius alone, is one part; a part that grows leaves nothing proved.
+    radius = np.zeros_like(matrix)
+    radius[np.flatnonzero(owner == 0)[0], np.flatnonzero(owner == 1)[0]] = 1e-12
+    assert len(contraction._separate_parts(Ball(matrix, radius))) == 2
+    growing = matrix + np.diag(np.where(owner == 2, 1.5, 0.0))
+    rate = 0.99 if discrete else 0.01
+    assert contraction.prove_contraction(growing, discrete=discrete, rate=rate) is None
+
+
 def test_poles_that_rounding_moves_are_told() -> None:
     assert rounding_of_eigenvalues(np.diag([-1.0, -2.0])) <= 1e-15
     assert rounding_of_eigenvalues(NEARLY_DEFECTIVE) > KNOWN_POLES

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import flint
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
@@ -191,6 +192,35 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
+    """Return a contraction at a rate; of many states those of filters that do not touch each other, beside each
+    other."""
+    parts = _separate_parts(ball) if ball.shape[0] > LYAPUNOV_SUMS_UP_TO else []
+    if len(parts) < 2:
+        return _tried_whole(ball, rate, discrete=discrete, sums_first=sums_first)
+    factor, inverse, defects, speed = np.zeros(ball.shape), np.zeros(ball.shape), np.zeros(len(parts)), 0.0
+    for i, part in enumerate(parts):
+        place = np.ix_(part, part)
+        own = Ball(ball.midpoint[place], ball.radius[place])
+        contraction = _tried_whole(own, rate, discrete=discrete, sums_first=sums_first)
+        if contraction is None:
+            return None
+        factor[place], inverse[place], defects[i] = contraction.Q, contraction.inverse, contraction.defect
+        speed = max(speed, contraction.speed)
+    # The norm of blocks beside each other is that of the largest one.
+    return Contraction(factor, inverse, float(np.max(defects)), rate, discrete, speed)
+
+
+def _separate_parts(ball: Ball) -> list[NDArray[np.int64]]:
+    """Return the states, in order, of each part of a matrix that is exactly zero between them."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    coupled = (ball.midpoint != 0.0) | (ball.radius > 0.0)
+    count, part_of = connected_components(csr_array(coupled), directed=False)
+    return [np.flatnonzero(part_of == i) for i in range(count)]
+
+
+def _tried_whole(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
     sums_first_factors = (_summed_factor, _lyapunov_factor, _precise_factor, _faster_lyapunov_factor)
     equations_first = (_lyapunov_factor, _faster_lyapunov_factor, _summed_factor, _precise_factor)
     for factor_of in sums_first_factors if sums_first else equations_first:
