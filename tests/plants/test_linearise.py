@@ -87,7 +87,7 @@ def test_the_exchanger_agrees_with_differences_of_its_equations():
     assert point["pressure"] == pytest.approx(2.001e5, rel=1e-12)
     import casadi as ca
 
-    from obsynth.plants.dae import symbols_of
+    from obsynth.plants.dae_equations import symbols_of
 
     s = symbols_of(model)
     x0 = np.array([point[name] for name in model.state_names])

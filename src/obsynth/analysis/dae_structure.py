@@ -12,8 +12,9 @@ from obsynth.numerics.arguments import arguments_checked, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
-from obsynth.plants.dae import DAEModel, checked_inputs, finite_vector, step_length
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import DAEFunctions
+from obsynth.plants.dae_signals import checked_inputs, finite_vector, step_length
 from obsynth.plants.implicit_step import ImplicitStep
 
 #: A start and one step.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
-from obsynth.plants.dae import finite_vector
+from obsynth.plants.dae_signals import finite_vector
 from obsynth.plants.signal_names import index_of, suggestion
 
 #: The fields of an observer that hold names.

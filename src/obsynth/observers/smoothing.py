@@ -29,7 +29,7 @@ from obsynth.observers.recursive.sample import RawEstimate, RecursiveState, devi
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.smoothing_chain import Node, ParameterInformation, Smoothed, SmootherHistory, StepLinearisation
 from obsynth.observers.taken_inputs import taken_inputs
-from obsynth.plants.dae import checked_inputs
+from obsynth.plants.dae_signals import checked_inputs
 
 SmoothedObserver = RecursiveObserver | DAEObserver
 

@@ -11,7 +11,8 @@ import numpy as np
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import chosen
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae import DAEModel, DAESymbols, symbols_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_equations import DAESymbols, symbols_of
 
 _ROOT_OF_SIX = np.sqrt(6.0)
 

@@ -13,8 +13,9 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import Seed, arguments_checked, require_shape
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.numerics.ranks import covariance_factor
-from obsynth.plants.dae import DAEModel, checked_inputs, finite_vector, step_length
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import Compiled, DAEFunctions, take_samples
+from obsynth.plants.dae_signals import checked_inputs, finite_vector, step_length
 from obsynth.plants.implicit_step import ImplicitStep, onto_constraint
 from obsynth.simulation.signals import Trajectory
 

@@ -23,7 +23,7 @@ from obsynth.monitoring.calibration.plants import (
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import rounding_rank
-from obsynth.plants.dae import symbolic_value
+from obsynth.plants.dae_equations import symbolic_value
 from obsynth.plants.dae_functions import BUTCHER
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import INDEX_NAME, MatrixSequence

@@ -12,7 +12,8 @@ import numpy as np
 from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae import DAEModel, symbols_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_equations import symbols_of
 from obsynth.plants.dae_functions import DAEFunctions
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.transformations.entries_in_constants import promoted

@@ -18,8 +18,9 @@ from obsynth.numerics.lapack import pencil_eigenvalues
 from obsynth.observers.nonlinear.estimates import DAERow, GatheredRows
 from obsynth.observers.nonlinear.observer import DAEObserver, advanced
 from obsynth.observers.records import named_bounds, named_covariance, named_vector
-from obsynth.plants.dae import DAEModel, step_length
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import local_equations
+from obsynth.plants.dae_signals import step_length
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
 LARGEST_TURN = 0.05

@@ -1,7 +1,7 @@
 """An observer of a DAE as C99 or a shared library: CasADi writes its graph, around it stands the loop of Newton.
 
-The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`; outliers, jumps, bounds of states and
-sensors of their own times are those of `obsynth.observers.dae.steps`.
+The loop is that of `obsynth.numerics.newton` and `obsynth.plants.implicit_step`; outliers, jumps, bounds of states and
+sensors of their own times are those of `obsynth.observers.nonlinear`.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from obsynth.observers.nonlinear.steps import DAEState, Steps
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
 from obsynth.observers.taken_inputs import require_inputs
-from obsynth.plants.dae import checked_inputs
 from obsynth.plants.dae_functions import Compiled, take_samples
+from obsynth.plants.dae_signals import checked_inputs
 
 #: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
 SAMPLES_PER_CALL = 10_000

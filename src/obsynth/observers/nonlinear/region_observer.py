@@ -27,7 +27,8 @@ from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import checked_sample, whole_record
 from obsynth.observers.running import Observer
-from obsynth.plants.dae import DAEModel, symbolic_value
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_equations import symbolic_value
 from obsynth.plants.dae_functions import DAEFunctions
 from obsynth.plants.implicit_step import ImplicitStep
 from obsynth.plants.operating_region import OperatingRegion

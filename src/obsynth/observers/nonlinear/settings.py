@@ -16,8 +16,9 @@ from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepObserver
-from obsynth.plants.dae import DAEModel, finite_vector, step_length
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import BUTCHER
+from obsynth.plants.dae_signals import finite_vector, step_length
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
 

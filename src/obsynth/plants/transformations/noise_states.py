@@ -11,7 +11,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray, require_no_overflow
-from obsynth.plants.dae import DAEModel, step_length
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_signals import step_length
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import (
     OFFSET_SIZE,

@@ -21,7 +21,8 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
-from obsynth.plants.dae import DAEModel, equation_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_equations import equation_of
 from obsynth.plants.scheduling import TEXTS_OF_OPERATIONS
 from obsynth.plants.signal_names import index_of
 

@@ -19,7 +19,8 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae import DAEModel, equation_of, symbols_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_equations import equation_of, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.linearisation import linearise
