@@ -25,6 +25,7 @@ from obsynth.numerics.libraries import imported
 from obsynth.plants.checking import Problems, checked_units
 from obsynth.plants.dae_checks import check_distinct, check_structure
 from obsynth.plants.dae_equations import EQUALS
+from obsynth.plants.dae_fields import DAEFields, Equations
 from obsynth.plants.signal_names import checked_names
 
 #: Names that mean something else in the language.
@@ -34,11 +35,8 @@ RESERVED = frozenset({*NAMED_NUMBERS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_W
 _DERIVATIVE_NAME = re.compile(r"der\(\w+\)")
 
 
-Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
-
-
 @dataclass(frozen=True, eq=False, init=False)
-class DAEModel:
+class DAEModel(DAEFields):
     r"""A nonlinear descriptor plant with constant or slowly changing parameters.
 
     .. math::
@@ -97,18 +95,6 @@ class DAEModel:
        2013, (3)-(4).  There h does not depend on theta only in the derivation; (21) needs it, and we allow it.
     """
 
-    equations: Equations
-    outputs: Equations
-    states: Mapping[str, float]
-    inputs: Mapping[str, float]
-    parameters: Mapping[str, float]
-    constants: Mapping[str, float]
-    definitions: Mapping[str, str]
-    units: Mapping[str, str]
-    storage: Callable[..., Sequence[Any]] | None
-    equation_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-
     def __init__(
         self,
         equations: Equations,
@@ -150,41 +136,6 @@ class DAEModel:
         known = {*required, *self.constants, *self.definitions}
         object.__setattr__(self, "units", problems.collect(lambda: checked_units(units, known)))
         problems.raise_if_any()
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the states, in order."""
-        return tuple(self.states)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Names of the known inputs, in order."""
-        return tuple(self.inputs)
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
-        return tuple(self.parameters)
-
-    @property
-    def nx(self) -> int:
-        """Number of states, and of equations."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of known inputs."""
-        return len(self.inputs)
-
-    @property
-    def ny(self) -> int:
-        """Number of outputs."""
-        return len(self.output_names)
-
-    @property
-    def nq(self) -> int:
-        """Number of parameters."""
-        return len(self.parameters)
 
     @property
     def nominal_state(self) -> FloatArray:

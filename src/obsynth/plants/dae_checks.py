@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +11,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.plants.checking import Problems
 from obsynth.plants.dae_equations import DAESymbols, symbols_of
-
-if TYPE_CHECKING:
-    from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_fields import DAEFields
 
 
-def check_distinct(model: DAEModel) -> None:
+def check_distinct(model: DAEFields) -> None:
     """Raise `SpecError` when a name stands for two things."""
     groups = (model.states, model.inputs, model.parameters, model.constants, model.definitions)
     names = [name for group in groups for name in group]
@@ -29,7 +27,7 @@ def check_distinct(model: DAEModel) -> None:
         )
 
 
-def check_structure(model: DAEModel, problems: Problems) -> None:
+def check_structure(model: DAEFields, problems: Problems) -> None:
     """Note what is wrong with the equations as a whole: their number, empty ones, signals that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
@@ -38,7 +36,7 @@ def check_structure(model: DAEModel, problems: Problems) -> None:
     _every_signal_used(model, symbols, problems)
 
 
-def _square(model: DAEModel, symbols: DAESymbols) -> None:
+def _square(model: DAEFields, symbols: DAESymbols) -> None:
     rows, ny = symbols.equations.numel(), symbols.outputs.numel()
     if rows != model.nx:
         few = "few" if rows < model.nx else "many"
@@ -57,7 +55,7 @@ def _square(model: DAEModel, symbols: DAESymbols) -> None:
         )
 
 
-def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
+def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
     by_input = _depends(symbols.stored, symbols.u)
     if by_input.any():
         name = model.input_names[int(np.argmax(by_input.any(axis=0)))]
@@ -79,7 +77,7 @@ def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
         raise SpecError(f"der(...){place} contains no state, so it is zero: differentiate a state.", path="equations")
 
 
-def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
+def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
     filled = _depends(symbols.equations, ca.vertcat(symbols.x, symbols.rates)).any(axis=1)
     empty = [repr(name) for name, full in zip(model.equation_names, filled, strict=False) if not full]
     if empty:
@@ -95,7 +93,7 @@ def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
         raise SpecError(f"The state {name!r} enters no equation: nothing determines it.", path=f"states.{name}")
 
 
-def _every_signal_used(model: DAEModel, symbols: DAESymbols, problems: Problems) -> None:
+def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems) -> None:
     """Note the first input and parameter that enter nothing, and the first output that nothing enters."""
     # What an output must not contain is said elsewhere.
     everything = ca.vertcat(symbols.equations, symbols.stored, symbols.outputs)

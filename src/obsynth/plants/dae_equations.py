@@ -5,17 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.expressions import Expression, parse_expression, step_function
-
-if TYPE_CHECKING:
-    from obsynth.plants.dae import DAEModel
-
+from obsynth.plants.dae_fields import DAEFields
 
 #: The sign between two sides, which is no part of a comparison.
 EQUALS = re.compile("(?<![<>=])=(?!=)")
@@ -34,7 +31,7 @@ class DAESymbols:
     outputs: Any
 
 
-def symbols_of(model: DAEModel) -> DAESymbols:
+def symbols_of(model: DAEFields) -> DAESymbols:
     """Return the symbols of a model."""
     return _from_functions(model) if callable(model.equations) else _from_texts(model, model.equations)
 
@@ -53,7 +50,7 @@ def symbolic_value(expression: Expression, known: Mapping[str, Any]) -> Any:
     return ca.SX(expression.translated(known, _translation))
 
 
-def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
+def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
     x, u, theta = _columns(model)
     known: dict[str, Any] = dict(model.constants)
     for names, column in ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta)):
@@ -76,7 +73,7 @@ def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
     return DAESymbols(rates, x, u, theta, ca.vertcat(*rows), ca.vertcat(*stored.values()), ca.vertcat(*outputs))
 
 
-def _from_functions(model: DAEModel) -> DAESymbols:
+def _from_functions(model: DAEFields) -> DAESymbols:
     x, u, theta = _columns(model)
     stored = x if model.storage is None else _called(model.storage, (x, theta), "storage")
     rates = ca.SX.sym("rates", stored.numel())
@@ -89,7 +86,7 @@ def _from_functions(model: DAEModel) -> DAESymbols:
     return DAESymbols(rates, x, u, theta, rows, stored, outputs)
 
 
-def _columns(model: DAEModel) -> tuple[Any, Any, Any]:
+def _columns(model: DAEFields) -> tuple[Any, Any, Any]:
     return tuple(
         ca.vertcat(*(ca.SX.sym(name) for name in names)) if names else ca.SX(0, 1)
         for names in (model.state_names, model.input_names, model.parameter_names)

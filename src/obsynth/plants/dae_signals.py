@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_given
-
-if TYPE_CHECKING:
-    from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_fields import DAEFields
 
 
 def step_length(dt: Any) -> float:
@@ -20,7 +18,7 @@ def step_length(dt: Any) -> float:
     return real_number(dt, "dt", "the seconds between samples, a positive number", above=0.0)
 
 
-def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> FloatArray:
+def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:
     """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
         raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")

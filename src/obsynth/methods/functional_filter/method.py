@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,10 +11,13 @@ from annotated_types import Ge
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
+from obsynth.methods.functional_filter.filter_models import filter_models, with_noise_of_gains
+from obsynth.methods.functional_filter.kalman_gain import FilterModel, require_noise
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
 from obsynth.numerics.arguments import FewSamples, NonNegative, OpenUnitInterval, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
@@ -192,7 +194,36 @@ class FunctionalFilter(Method):
 
     def require_stated(self, plant: DescriptorSystem) -> None:
         """Raise `PreconditionError` where a combination of the outputs that the gain reads has no noise."""
-        import_module("obsynth.methods.functional_filter.synthesis").require_stated(plant, self)
+        self.require_samples(plant)
+        noisy, _ = with_noise_of_gains(plant, self.sensor_noise(plant), needed=self.has_kalman_gains)
+        if self.has_kalman_gains:
+            for model in self.filter_models(noisy, exosystem(self.fault_model, plant.fault_names, plant.dt)):
+                require_noise(model, noisy.output_names, noisy.Dw)
+
+    def filter_models(self, plant: DescriptorSystem, model: Exosystem) -> list[FilterModel]:
+        """Return a filter model for each group of faults that one filter serves; none where only states are named."""
+        if self.is_for_states_alone:
+            return []
+        return filter_models(plant, model, faults=self.faults, residuals=self.residuals, joint=self.joint)
+
+    @property
+    def is_for_states_alone(self) -> bool:
+        """Whether states are to be estimated, and no faults."""
+        return self.states is not None and self.faults is None
+
+    @property
+    def has_kalman_gains(self) -> bool:
+        """Whether gains of faults or residuals are weighed against noise."""
+        return self.poles is None and not self.is_for_states_alone
+
+    def require_samples(self, plant: DescriptorSystem) -> None:
+        """Raise `SpecError` where options count samples and the plant is continuous."""
+        late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
+        if late and not plant.dt > 0.0:
+            raise SpecError(
+                f"{' and '.join(late)} count samples, but the plant is continuous: sample it (transform: sample_time).",
+                path="method.options",
+            )
 
     def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
         """Whether states are named, which a reduced plant may not have."""

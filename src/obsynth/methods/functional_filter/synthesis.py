@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from obsynth.analysis.existence.functional_filter import chosen_faults, residual_sets
+from obsynth.analysis.existence.functional_filter import residual_sets
 from obsynth.analysis.existence.functional_states import chosen_states, fixed_modes, state_goals, without_faults
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.functional_filter.assembly import FilterPart, assembled, filter_part
+from obsynth.methods.functional_filter.filter_models import (
+    with_noise_of_gains,
+)
 from obsynth.methods.functional_filter.functional_observer import functional_part
 from obsynth.methods.functional_filter.kalman_gain import (
     RATE_REACHED,
@@ -39,7 +42,6 @@ from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
-from obsynth.plants.noise import assumed_noise_names
 from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import slowest_decay, stability_factor
@@ -50,13 +52,13 @@ SLOW_ERRORS = 20.0
 
 def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.functional_filter` for the options, results and errors."""
-    _require_samples(plant, method)
+    method.require_samples(plant)
     model = exosystem(method.fault_model, plant.fault_names, plant.dt)
     progress("checking the existence conditions")
     require_all_conditions(method.existence(plant))
-    noisy, notes = _with_noise(plant, method)
+    noisy, notes = with_noise_of_gains(plant, method.sensor_noise(plant), needed=method.has_kalman_gains)
     progress("decoupling the unknown inputs")
-    models = _models(noisy, model, method)
+    models = method.filter_models(noisy, model)
     progress("choosing the gains")
     of_states = _state_parts(noisy, model, method)
     for longer in (MOST_LONGER, 0):
@@ -118,63 +120,6 @@ def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> boo
     except PreconditionError:
         return False
     return True
-
-
-def require_stated(plant: DescriptorSystem, method: FunctionalFilter) -> None:
-    """Raise `PreconditionError` where a Kalman gain would be infinite: a combination of the outputs has no noise."""
-    _require_samples(plant, method)
-    noisy, _ = _with_noise(plant, method)
-    if method.poles is None and not _is_for_states_alone(method):
-        for model in _models(noisy, exosystem(method.fault_model, plant.fault_names, plant.dt), method):
-            require_noise(model, noisy.output_names, noisy.Dw)
-
-
-def _require_samples(plant: DescriptorSystem, method: FunctionalFilter) -> None:
-    late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(method, name) != default]
-    if late and not plant.dt > 0.0:
-        raise SpecError(
-            f"{' and '.join(late)} count samples, but the plant is continuous: sample it (transform: sample_time).",
-            path="method.options",
-        )
-
-
-def _with_noise(plant: DescriptorSystem, method: FunctionalFilter) -> tuple[DescriptorSystem, tuple[str, ...]]:
-    """Return the plant with the noise that the gains are for."""
-    stated = method.sensor_noise(plant)
-    if stated is None and plant.nw:
-        return plant, ()
-    if stated is None and (method.poles is not None or _is_for_states_alone(method)):
-        return plant, ()
-    deviations = np.ones(plant.ny) if stated is None else stated
-    process = np.flatnonzero(plant.Bw.any(axis=0))
-    named = [f"noise {name}" for name in plant.output_names]
-    names = assumed_noise_names(plant.output_names) if stated is None else named
-    noisy = plant.replace(
-        Bw=np.hstack([plant.Bw[:, process], np.zeros((plant.nx, plant.ny))]),
-        Dw=np.hstack([plant.Dw[:, process] * 0.0, np.diag(deviations)]),
-        noise_names=[*(plant.noise_names[i] for i in process), *names],
-    )
-    note = "No noise is stated: every sensor is assumed to have the standard deviation 1 in its own unit."
-    return noisy, () if stated is not None else (note,)
-
-
-def _is_for_states_alone(method: FunctionalFilter) -> bool:
-    return method.states is not None and method.faults is None
-
-
-def _models(plant: DescriptorSystem, model: Exosystem, method: FunctionalFilter) -> list[FilterModel]:
-    """Return a filter model for each group of faults that one filter serves."""
-    if _is_for_states_alone(method):
-        return []
-    groups = sets = residual_sets(method.residuals, plant)
-    if groups is None:
-        chosen = chosen_faults(method.faults, plant)
-        groups = [chosen] if method.joint else [[fault] for fault in chosen]
-    complements = ([j for j in range(plant.nf) if j not in group] for group in groups)
-    return [
-        filter_model(plant, model, removed=removed, faults=group if sets is None else ())
-        for group, removed in zip(groups, complements, strict=True)
-    ]
 
 
 def _parts(
@@ -265,7 +210,7 @@ def _resolved(
     options = method.as_plain()
     options["faults"] = (
         None
-        if method.residuals is not None or _is_for_states_alone(method)
+        if method.residuals is not None or method.is_for_states_alone
         else [plant.fault_names[i] for i in estimated]
     )
     options["fault_model_in_words"] = dict(zip(plant.fault_names, model.descriptions, strict=True))
