@@ -10,7 +10,7 @@ from test_export import digest, through_c
 
 import obsynth
 from obsynth import PreconditionError, SolverError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.recursive.gain_schedule import steady_observer
+from obsynth.observers.recursive.steady_observer import steady_observer
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 

@@ -28,8 +28,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
-from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_observer import steady_observer
 
 SAMPLES = 24
 #: The methods of obsynth, and one that a test registers: it has a folder and one line of the registry, no more.

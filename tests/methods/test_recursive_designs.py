@@ -13,7 +13,7 @@ import obsynth
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.cli.main import main
 from obsynth.methods.designing import check
-from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.batches import run_batch
 from obsynth.observers.recursive.gain_schedule_summary import FOLLOW_FURTHER, end_of_steps, gain_schedule_summary
 from obsynth.specs.loader import load_spec
 

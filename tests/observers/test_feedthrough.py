@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 import obsynth
-from obsynth.observers.recursive.gain_schedule import run_batch, steady_observer
+from obsynth.observers.recursive.batches import run_batch
+from obsynth.observers.recursive.steady_observer import steady_observer
 
 D = np.array([[2.0, 0.0], [0.0, -0.5]])
 

@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.batches import run_batch
 from obsynth.simulation.linear import simulate_time_varying
 from obsynth.specs.documents import read_yaml
 from obsynth.specs.loader import Spec, load_spec

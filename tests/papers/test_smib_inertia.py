@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import obsynth
-from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.batches import run_batch
 from obsynth.simulation.linear import varying_runs
 from obsynth.specs.documents import read_yaml
 from obsynth.specs.loader import load_spec

@@ -18,8 +18,8 @@ from obsynth.observers.linear.missing_samples import GAP_LEFT_SHARE, LEAST_SHOWN
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_observer import steady_observer
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

@@ -19,7 +19,7 @@ from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_fo
 from obsynth.numerics.arguments import field_types
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
-from obsynth.observers.recursive.gain_schedule import steady_observer
+from obsynth.observers.recursive.steady_observer import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario

@@ -59,6 +59,8 @@ LONGEST_FROM_REST, MOST_INPUTS_FROM_REST = 60, 360
 CLEAR_KERNEL = 1e-5
 #: Outputs that show w by less than this share of the problem's sizes do not show it.
 BLIND_SHARE = 1e-10
+#: They are looked at at two angles, neither a simple part of the circle: a response that vanishes at both vanishes.
+BLIND_ANGLES = np.array([0.7, 2.1])
 #: Directions that w reaches by less than this share are not reached.
 REACHED_BY_NOISE = 1e-9
 #: A level counts as attained where the norm of its filter is at most this share above it.
@@ -237,8 +239,7 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
     n, rows, size = len(problem.A), len(problem.C), _size(problem)
     stable = bool(np.max(np.abs(np.linalg.eigvals(problem.A)), initial=0.0) < STABLE_RADIUS)
     blind = (
-        not problem.B.shape[1]
-        or np.max(np.abs(_responses(problem, np.array([0.7, 2.1]))[1]), initial=0.0) < BLIND_SHARE * size
+        not problem.B.shape[1] or np.max(np.abs(_responses(problem, BLIND_ANGLES)[1]), initial=0.0) < BLIND_SHARE * size
     )
     if not rows or (blind and stable):
         if not stable:

@@ -19,7 +19,7 @@ from obsynth.observers.nonlinear.estimates import DAERow
 from obsynth.observers.nonlinear.observer import DAEObserver, advanced
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import batch_record
-from obsynth.observers.recursive import gain_schedule
+from obsynth.observers.recursive.batches import run_batch as run_recursive_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import named_estimates
 
@@ -169,7 +169,7 @@ def run_batch(
         return _one_by_one(observer, y, u)
     if isinstance(observer, DAEObserver):
         return run_dae_batch(observer, y, u, **options)
-    return gain_schedule.run_batch(observer, y, u, **options)
+    return run_recursive_batch(observer, y, u, **options)
 
 
 def _one_by_one(

@@ -27,6 +27,9 @@ DEPENDENT_ROW = 1e-13
 #: Newton steps towards the exact solution before it is rounded for the last time.
 RATIONAL_REFINEMENTS = 4
 
+#: They end where a step is not below this share of the smallest one before: Newton's steps then only go to and fro.
+REFINED_SHARE = 0.5
+
 #: Bits of ball arithmetic where double precision proves no inverse, and the most rows for it.
 INVERSE_BITS, MOST_ROWS_IN_BALLS = 256, 700
 
@@ -81,7 +84,7 @@ def nearby_solution(
         for _ in range(RATIONAL_REFINEMENTS):
             lacking = np.array([float(value) for value in missing(values)])
             size = float(np.max(np.abs(square.step(lacking) / np.ldexp(1.0, square.columns)), initial=0.0))
-            if not size < 0.5 * smallest:
+            if not size < REFINED_SHARE * smallest:
                 break
             smallest = size
             values[square.chosen] += square.step(lacking)

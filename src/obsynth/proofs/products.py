@@ -43,6 +43,9 @@ AT_ONCE = 16
 #: No standard bounds the rounding of logarithms: a few units in the last place, and more than that.
 LOGARITHMS = 1e-14
 
+#: Axes further from orthonormal than this have no inverse that is bounded well: the bound has ``1 / (1 - defect)``.
+LARGEST_DEFECT = 0.5
+
 
 def exponential(matrix: FloatArray, time: float) -> Ball:
     """Return a ball that holds ``e^{A t}`` of ``A (n, n)``; its radius is infinite where nothing is known."""
@@ -162,7 +165,7 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
         following = np.linalg.qr(moved.midpoint @ axes)[0]
         # An upper bound on |U' U - I|.
         slack = (Ball.exact(following.T) @ Ball.exact(following) - Ball.exact(np.eye(size))).frobenius_norm
-        if not slack < 0.5:
+        if not slack < LARGEST_DEFECT:
             return np.inf
         near = Ball.exact(following.T) @ moved @ Ball.exact(axes)
         triangle = near.magnitude

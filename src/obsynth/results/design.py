@@ -257,7 +257,7 @@ class ObserverDesign:
 
     def _constant_observer(self) -> LinearObserver:
         """Return the observer, of a recursive design its steady state."""
-        from obsynth.observers.recursive.gain_schedule import steady_observer
+        from obsynth.observers.recursive.steady_observer import steady_observer
 
         if isinstance(self.observer, RecursiveObserver):
             return steady_observer(self.observer).observer

@@ -18,7 +18,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
-from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.batches import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver

@@ -25,6 +25,8 @@ from obsynth.proofs.vertex_inequalities import prove_nonsingular
 
 #: What is kept of ``1 / |Delta^-1|`` in its proof, largest share first.
 EFFECTIVENESS_SHARES = (1.0 - 1e-9, 0.99, 0.5, 0.1)
+#: Roundings of an entry by a least-squares solution, beside the largest entry, for each row.
+LEAST_SQUARES_ROUNDINGS = 16.0
 _SOURCE = "over the region: Wang 2015 with constant T, N"
 #: exp(dt A(mu)) has no vertices: what helps a filter of samples where the plant is continuous.
 _CONTINUOUS = (
@@ -170,7 +172,9 @@ def _directions(plant: PolytopicSystem) -> tuple[FloatArray, tuple[FloatArray, .
 def _cleaned(matrix: FloatArray) -> FloatArray:
     """Return a matrix without what is rounding beside its largest entry."""
     size = float(np.max(np.abs(matrix), initial=0.0))
-    return np.where(np.abs(matrix) > len(matrix) * 16.0 * np.finfo(np.float64).eps * size, matrix, 0.0)
+    return np.where(
+        np.abs(matrix) > len(matrix) * LEAST_SQUARES_ROUNDINGS * np.finfo(np.float64).eps * size, matrix, 0.0
+    )
 
 
 def _direction_condition(plant: PolytopicSystem, directions: object) -> Condition:

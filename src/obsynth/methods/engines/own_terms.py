@@ -51,6 +51,9 @@ CLAIM_ROOM = 1e-3
 #: Multiples of a rate among which one inside a region is looked for.
 RATE_MULTIPLES = np.logspace(-4, 4, 161)
 
+#: A rate is well inside a region where its margin is above this share of the largest one.
+WELL_INSIDE = 0.5
+
 #: Eigenvalues may be outside a region by this much, by a solver's rounding.
 REGION_TOLERANCE = 1e-6
 
@@ -171,7 +174,7 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
         return delta
     rates = RATE_MULTIPLES * (1.0 / delta)
     margins = where.margins(-rates) / rates
-    inside = rates[margins > 0.5 * np.max(margins)]
+    inside = rates[margins > WELL_INSIDE * np.max(margins)]
     return float(1.0 / inside[np.argmin(np.abs(np.log(inside * delta)))]) if len(inside) else delta
 
 

@@ -56,6 +56,9 @@ CLEARLY_MORE = 1.25
 #: Ratios nearer to one than this factor are not told: nobody knows a variance better.
 TOLD_FACTOR = 1.5
 
+#: A factor this near a whole number, of that, is written as its word: it is an estimate itself.
+WORD_SHARE = 0.25
+
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
 OFFSET = 3.0
@@ -559,4 +562,4 @@ def _times(factor: float) -> str:
         return "more than a thousand times"
     words = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
     near = round(factor)
-    return f"{words[near]} times" if near in words and abs(factor - near) < 0.25 * near else f"{factor:.3g} times"
+    return f"{words[near]} times" if near in words and abs(factor - near) < WORD_SHARE * near else f"{factor:.3g} times"

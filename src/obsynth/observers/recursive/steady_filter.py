@@ -20,8 +20,8 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
-from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_observer import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

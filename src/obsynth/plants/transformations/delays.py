@@ -33,6 +33,9 @@ MOST_PADE_ORDER = 8
 #: A Pade approximation is good as far as it is off by at most this share.
 PADE_SHARE = 0.05
 
+#: Where that angle is looked for, in rad over the delay: even of order one it is above the first, and then by steps.
+FIRST_ANGLE, ANGLE_RATIO = 0.5, 1.1
+
 #: Delays that are multiples of one time get samples of that time where these are at most so many.
 FEW_SAMPLES = 25
 
@@ -279,7 +282,8 @@ def good_up_to(order: int) -> float:
         at = 1j * angle
         return float(abs(np.polyval(numerator, at) / np.polyval(denominator, at) - np.exp(-at))) - PADE_SHARE
 
-    high = 0.5
+    high = FIRST_ANGLE
     while missed(high) < 0.0:
-        high *= 1.1
-    return float(scipy.optimize.brentq(missed, high / 1.1, high)) if missed(high / 1.1) < 0.0 else high
+        high *= ANGLE_RATIO
+    low = high / ANGLE_RATIO
+    return float(scipy.optimize.brentq(missed, low, high)) if missed(low) < 0.0 else high
