@@ -1,0 +1,110 @@
+"""The variables of an observer's FMU: inputs, estimates, operating points and alarms, each with name and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from obsynth.exporting.alarms import Alarms
+from obsynth.exporting.realisation import Realisation
+from obsynth.results.design import ObserverDesign
+
+
+@dataclass(frozen=True)
+class Output:
+    """One output: its name, the signal whose operating point is added to it, its unit and description."""
+
+    name: str
+    signal: str | None
+    unit: str
+    description: str
+
+
+@dataclass(frozen=True)
+class FmuSignals:
+    """Inputs, outputs, operating points and alarms of an FMU, in the order of its values."""
+
+    inputs: tuple[str, ...]
+    input_signals: tuple[str, ...]
+    outputs: tuple[Output, ...]
+    points: Mapping[str, float]
+    alarms: Alarms
+    units: Mapping[str, str]
+    dt: float
+
+    def point_index(self, signal: str | None) -> int:
+        """Return the position of a signal among the operating points, -1 for none."""
+        return -1 if signal is None else list(self.points).index(signal)
+
+
+def signals_of_linear(realisation: Realisation, alarms: Alarms) -> FmuSignals:
+    """Return the signals of a linear observer; fault estimates and residuals may be watched."""
+    plant, observer = realisation.design.plant, realisation.observer
+    biases = getattr(plant, "sensor_faults", ())
+    units, operating_point = dict(plant.units), dict(getattr(plant, "operating_point", {}))
+    outputs = [
+        Output(f"xhat[{name}]", name, units.get(name, ""), _delayed(f"estimate of {name}", delay))
+        for name, delay in zip(observer.state_names, observer.state_delays, strict=True)
+    ]
+    outputs += [
+        Output(
+            f"fhat[{name}]",
+            None if name in biases else name,
+            units.get(name, ""),
+            _delayed(f"estimate of the fault {name}", delay),
+        )
+        for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
+    ]
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}") for name in observer.residual_names]
+    outputs += _monitor_outputs(alarms)
+    signals = (*realisation.inputs, *observer.state_names, *observer.fault_names)
+    points = {name: float(operating_point.get(name, 0.0)) for name in dict.fromkeys(signals)}
+    inputs = _distinct(observer.input_names, observer.output_names)
+    return FmuSignals(inputs, realisation.inputs, tuple(outputs), points, alarms, units, observer.dt)
+
+
+def _monitor_outputs(alarms: Alarms) -> list[Output]:
+    """Return the outputs of a monitor, if there is one."""
+    variables = () if alarms.monitor is None else alarms.monitor.variables
+    return [Output(variable.name, None, "", variable.description) for variable in variables]
+
+
+def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> FmuSignals:
+    """Return the signals of the observer of a nonlinear plant; parameters, innovations and their square may be
+    watched."""
+    model, observer = design.nonlinear
+    units = dict(model.units)
+    estimated = (("xhat", "", model.state_names), ("fhat", "the parameter ", model.parameter_names))
+    outputs = []
+    for kind, of, names in estimated:
+        outputs += [Output(f"{kind}[{name}]", None, units.get(name, ""), f"estimate of {of}{name}") for name in names]
+        outputs += [
+            Output(f"sd {kind}[{name}]", None, units.get(name, ""), f"standard deviation of the estimate of {name}")
+            for name in names
+        ]
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}") for name in model.output_names]
+    outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance"))
+    outputs += _monitor_outputs(alarms)
+    return FmuSignals(
+        _distinct(model.input_names, model.output_names),
+        (*model.input_names, *model.output_names),
+        tuple(outputs),
+        {},
+        alarms,
+        units,
+        observer.dt,
+    )
+
+
+def _delayed(text: str, delay: int) -> str:
+    """Return a description, with the delay of the estimate where it has one."""
+    return f"{text}, delayed by {delay} sample(s)" if delay else text
+
+
+def _distinct(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the FMU's inputs: inputs and outputs, as u[.] and y[.] where they share a name."""
+    both = set(known) & set(measured)
+    return (
+        *(f"u[{name}]" if name in both else name for name in known),
+        *(f"y[{name}]" if name in both else name for name in measured),
+    )
