@@ -189,7 +189,7 @@ def _state_struct(realisation: Realisation, prefix: str, alarms: Alarms) -> list
         "inputs": gap.kept_inputs * nu,
         "fault": gap.faults,
         "shown": compared,
-        "seen": gap.seen,
+        "seen": gap.known_states,
         "model": gap.states,
         "left": nz * (nu + ny),
         "held": nu,
@@ -223,28 +223,77 @@ def _state_struct(realisation: Realisation, prefix: str, alarms: Alarms) -> list
 
 def source_text(realisation: Realisation, prefix: str, header: str, alarms: Alarms) -> str:
     """Return the source."""
-    observer, gap = realisation.observer, realisation.gap
+    groups, output_products = _output_products(realisation)
+    step_products: dict[str, dict[str, FloatArray]] = {"next": realisation.transition}
+    products = {**output_products, **step_products}
+    large = any(_form(matrix) != PLAIN for parts in products.values() for matrix in parts.values())
+    lines = [
+        *_source_head(realisation, header, alarms),
+        *([comment(ADVICE), ""] if large else []),
+        *_product_tables(products),
+        *_constant_tables(realisation, alarms),
+        "",
+        template("products.c"),
+        *_products("say", ("z", "u", "y"), output_products, groups),
+        *_products("next_of", tuple(realisation.transition), step_products, ("next",)),
+        alarms.source(prefix),
+        _step_text(realisation, prefix, alarms),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _output_products(realisation: Realisation) -> tuple[tuple[str, ...], dict[str, dict[str, FloatArray]]]:
+    """Return the groups of output rows, and for each that has rows its matrices on the state, inputs and outputs."""
+    observer, running = realisation.observer, realisation.running
     groups = {"states": observer.state_rows, "faults": observer.fault_rows, "residuals": observer.residual_rows}
-    output_products: dict[str, dict[str, FloatArray]] = {
-        target: {
-            "z": realisation.running.Cz[rows],
-            "u": realisation.running.Du[rows],
-            "y": realisation.running.Dy[rows],
-        }
-        for target, rows in groups.items()
+    products = {
+        group: {"z": running.Cz[rows], "u": running.Du[rows], "y": running.Dy[rows]}
+        for group, rows in groups.items()
         if rows.stop > rows.start
     }
-    moved: dict[str, dict[str, FloatArray]] = {"next": realisation.transition}
-    large = any(
-        _form(matrix) != PLAIN for parts in (*output_products.values(), *moved.values()) for matrix in parts.values()
-    )
-    tables = [
-        line
-        for target, parts in {**output_products, **moved}.items()
-        for signal, matrix in parts.items()
-        if matrix.size
-        for line in _tables(f"{target}_{signal}", matrix)
+    return tuple(groups), products
+
+
+def _source_head(realisation: Realisation, header: str, alarms: Alarms) -> list[str]:
+    """Return what precedes the tables: what the file is, includes, macros and sizes."""
+    gap = realisation.gap
+    return [
+        comment(f"sha256 of the gain set: {realisation.digest}"),
+        comment(quoted(verification_words(realisation.design))),
+        f'#include "{included(header)}"',
+        "",
+        "#include <math.h>",
+        "#include <stddef.h>",
+        "",
+        "#if defined(__FAST_MATH__)",
+        "#error a missing sample is NaN, which -ffast-math does not know",
+        "#endif",
+        "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
+        "#define ABS(x) ((x) < 0 ? -(x) : (x))",
+        f"#define MODEL {int(gap.exists)}",
+        f"#define SOLVED {int(gap.solved)}",
+        f"#define STRAIGHT {int(realisation.straight)}",
+        f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
+        f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
+        f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
+        "enum {",
+        *(f"    {name} = {value}," for name, value in _sizes(realisation).items()),
+        "};",
+        "",
     ]
+
+
+def _product_tables(products: Mapping[str, Mapping[str, FloatArray]]) -> Iterator[str]:
+    """Yield the tables of the matrices of products, by target and signal."""
+    for target, parts in products.items():
+        for signal, matrix in parts.items():
+            if matrix.size:
+                yield from _tables(f"{target}_{signal}", matrix)
+
+
+def _constant_tables(realisation: Realisation, alarms: Alarms) -> Iterator[str]:
+    """Yield the tables of the first state, the operating point, levels of alarms, and the model for missing samples."""
+    observer, gap = realisation.observer, realisation.gap
     before, after = realisation.operating_point
     constants = {
         "start": realisation.start.reshape(1, -1),
@@ -253,46 +302,10 @@ def source_text(realisation: Realisation, prefix: str, header: str, alarms: Alar
         "levels": np.array([list(alarms.levels.values())]),
         **gap.tables,
     }
-    return (
-        "\n".join(
-            [
-                comment(f"sha256 of the gain set: {realisation.digest}"),
-                comment(quoted(verification_words(realisation.design))),
-                f'#include "{included(header)}"',
-                "",
-                "#include <math.h>",
-                "#include <stddef.h>",
-                "",
-                "#if defined(__FAST_MATH__)",
-                "#error a missing sample is NaN, which -ffast-math does not know",
-                "#endif",
-                "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
-                "#define ABS(x) ((x) < 0 ? -(x) : (x))",
-                f"#define MODEL {int(gap.exists)}",
-                f"#define SOLVED {int(gap.solved)}",
-                f"#define STRAIGHT {int(realisation.straight)}",
-                f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
-                f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
-                f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
-                "enum {",
-                *(f"    {name} = {value}," for name, value in _sizes(realisation).items()),
-                "};",
-                "",
-                *([comment(ADVICE), ""] if large else []),
-                *tables,
-                *(line for name, table in constants.items() for line in table_lines(name, filled_table(table))),
-                *integer_table("told", gap.told),
-                *integer_table("watched", range(len(alarms.levels))),
-                "",
-                template("products.c"),
-                *_products("say", ("z", "u", "y"), output_products, tuple(groups)),
-                *_products("next_of", tuple(realisation.transition), moved, ("next",)),
-                alarms.source(prefix),
-                _step_text(realisation, prefix, alarms),
-            ]
-        )
-        + "\n"
-    )
+    for name, table in constants.items():
+        yield from table_lines(name, filled_table(table))
+    yield from integer_table("told", gap.estimated)
+    yield from integer_table("watched", range(len(alarms.levels)))
 
 
 def _sizes(realisation: Realisation) -> dict[str, int]:
@@ -310,7 +323,7 @@ def _sizes(realisation: Realisation) -> dict[str, int]:
         "SHOWN_COUNT": compared,
         "WATCHED_COUNT": compared + 1,
         "MODEL_STATES": gap.states,
-        "SEEN_COUNT": gap.seen,
+        "SEEN_COUNT": gap.known_states,
         "PLANT_FAULTS": gap.faults,
         "KEPT_INPUTS": gap.kept_inputs,
         "LEAST_SHOWN": gap.least_shown,
@@ -469,5 +482,5 @@ def filled_template(name: str, prefix: str, words: Mapping[str, str], package: s
         text = re.sub(rf"^ *{word}\n", "", text, flags=re.MULTILINE)
     replacements = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}
     return re.sub(
-        "|".join(sorted(replacements, key=len, reverse=True)), lambda found: replacements[found.group()], text
+        "|".join(sorted(replacements, key=len, reverse=True)), lambda match: replacements[match.group()], text
     )

@@ -51,23 +51,23 @@ def is_window(design: ObserverDesign) -> bool:
 def window_c_texts(realisation: Realisation, prefix: str, header: str) -> tuple[str, str]:
     """Return source and header."""
     test = GuaranteedTest.of(realisation.design)
-    observer, count = realisation.observer, len(test.tests)
-    length = observer.order // count + 1
-    nu, ny = len(observer.input_names), len(observer.output_names)
-    sizes = {"TESTS": count, "LENGTH": length, "WIDTH": nu + ny, "NU": nu}
-    tables = {
-        "weights": _weights(realisation, count, length),
-        "limits": np.array([[row_test.threshold for row_test in test.tests]]),
-        "constants": observer.added[None],
-        "rounding": np.array([row_test.certificate.matrices["rounding"].ravel() for row_test in test.tests]),
-    }
+    count = len(test.tests)
+    length = realisation.observer.order // count + 1
+    nu, ny = len(realisation.observer.input_names), len(realisation.observer.output_names)
     taken = ([f"const double u[{nu}]"] if nu else []) + [f"const double y[{ny}]"]
     arguments = [f"{prefix}_state *state", *taken, f"double values[{count}]", f"double thresholds[{count}]"]
     signature = f"int {prefix}_step({', '.join(arguments)})"
-    upper = prefix.upper()
+    source = _window_source(realisation, test, prefix, header, signature, length)
+    return source, _window_header(realisation, test, prefix, signature, length)
+
+
+def _window_header(realisation: Realisation, test: GuaranteedTest, prefix: str, signature: str, length: int) -> str:
+    """Return the header: what the file is, the state, and the step with its tests and signals by number."""
+    observer, upper = realisation.observer, prefix.upper()
+    width = len(observer.input_names) + len(observer.output_names)
     names, groups = realisation.design.linear[0].fault_names, groups_of(test) if is_bank(test) else None
     group_texts = [test.fault] if groups is None else [" or ".join(names[k] for k in group) for group in groups]
-    declared = [
+    lines = [
         comment(f"Test {quoted(test.name)} by {quoted(test.method)}, written by obsynth."),
         *([comment(quoted(realisation.mark))] if realisation.mark else []),
         f"#ifndef {upper}_H",
@@ -80,8 +80,8 @@ def window_c_texts(realisation: Realisation, prefix: str, header: str) -> tuple[
         f"#define {upper}_LENGTH {length}",
         "",
         "typedef struct {",
-        f"    double window[{length}][{nu + ny}];",
-        f"    double largest[{nu + ny}];",
+        f"    double window[{length}][{width}];",
+        f"    double largest[{width}];",
         "    int at;",
         "    int rows;",
         f"}} {prefix}_state;",
@@ -98,9 +98,25 @@ def window_c_texts(realisation: Realisation, prefix: str, header: str) -> tuple[
         "",
         "#endif",
     ]
+    return "\n".join(lines) + "\n"
+
+
+def _window_source(
+    realisation: Realisation, test: GuaranteedTest, prefix: str, header: str, signature: str, length: int
+) -> str:
+    """Return the source: sizes, tables of weights, thresholds and rounding, and the step from its template."""
+    observer, count = realisation.observer, len(test.tests)
+    nu, ny = len(observer.input_names), len(observer.output_names)
+    sizes = {"TESTS": count, "LENGTH": length, "WIDTH": nu + ny, "NU": nu}
+    tables = {
+        "weights": _weights(realisation, count, length),
+        "limits": np.array([[row_test.threshold for row_test in test.tests]]),
+        "constants": observer.added[None],
+        "rounding": np.array([row_test.certificate.matrices["rounding"].ravel() for row_test in test.tests]),
+    }
     copied = "for (i = 0; i < NU; i++) {\n        newest[i] = u[i];\n    }" if nu else ""
     body = filled_template("window_test.c", prefix, {"SIGNATURE": signature, "COPY_INPUTS": copied})
-    source = [
+    lines = [
         comment(f"sha256 of the gain set: {realisation.digest}"),
         *([comment(quoted(realisation.mark))] if realisation.mark else []),
         f'#include "{included(header)}"',
@@ -111,8 +127,10 @@ def window_c_texts(realisation: Realisation, prefix: str, header: str) -> tuple[
         "",
         comment("by test: weights of inputs and outputs, the newest sample first"),
         *(line for name, table in tables.items() for line in table_lines(name, table)),
+        "",
+        body,
     ]
-    return "\n".join([*source, "", body]), "\n".join(declared) + "\n"
+    return "\n".join(lines)
 
 
 def _weights(realisation: Realisation, count: int, length: int) -> FloatArray:

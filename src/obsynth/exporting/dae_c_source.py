@@ -57,8 +57,8 @@ def write_dae_c(
     source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms, outliers)
     if precision == "float":
         source, declarations = in_floats(source), in_floats(declarations)
-        said = float_error(design, prefix, source, declarations)
-        declarations = f"{comment(quoted(said))}\n{declarations}"
+        error_note = float_error(design, prefix, source, declarations)
+        declarations = f"{comment(quoted(error_note))}\n{declarations}"
     return write_together({target: source, header: with_c_linkage(declarations, prefix)})
 
 

@@ -67,11 +67,12 @@ def in_precision(text: str, precision: str) -> str:
     return "\n".join(rounded)
 
 
-def _as_float(found: re.Match[str]) -> str:
-    value = np.float32(found.group())
+def _as_float(match: re.Match[str]) -> str:
+    """Return a matched number as a float of C."""
+    value = np.float32(match.group())
     if not np.isfinite(value):
         raise SpecError(
-            f"{found.group()} is beyond the largest number of precision 'float': scale the signals, or export doubles.",
+            f"{match.group()} is beyond the largest number of precision 'float': scale the signals, or export doubles.",
             path="precision",
         )
     return f"{value}f"
@@ -97,10 +98,10 @@ def float_error(design: ObserverDesign, prefix: str, source: str, declared: str)
         library = _compiled(folder, prefix, source, declared, model.nu, model.ny, (model.nx, model.nq))
         for seed in SEEDS:
             u, y, expected = _record(design, seed)
-            wanted = np.hstack([expected.states, expected.faults])
+            expected_estimates = np.hstack([expected.states, expected.faults])
             deviations = np.hstack([expected.state_deviations, expected.fault_deviations])
-            found = _taken(library, u, y, wanted.shape[1])
-            error = np.abs(found - wanted)
+            estimates = _run_in_floats(library, u, y, expected_estimates.shape[1])
+            error = np.abs(estimates - expected_estimates)
             worst = np.maximum(worst, error.max(axis=0))
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.where(error > 0.0, error / deviations, 0.0)[1:]
@@ -126,7 +127,7 @@ def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, 
     model, observer = design.nonlinear
     u = np.tile(model.nominal_input, (RECORD_SAMPLES, 1)).reshape(RECORD_SAMPLES, model.nu)
     try:
-        found = simulate_dae(
+        simulation = simulate_dae(
             model,
             u,
             dt=observer.dt,
@@ -137,9 +138,9 @@ def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, 
             integration=observer.integration,
             seed=seed,
         )
-        y = np.array(found.outputs)
+        y = np.array(simulation.outputs)
         y[MISSING_SAMPLES] = np.nan
-        u, y = (given.astype(np.float32).astype(np.float64) for given in (u, y))
+        u, y = (values.astype(np.float32).astype(np.float64) for values in (u, y))
         return u, y, observer.run(y, u)
     except ObsynthError as error:
         raise SpecError(
@@ -152,6 +153,7 @@ def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, 
 def _compiled(
     folder: Path, prefix: str, source: str, declared: str, nu: int, ny: int, counts: tuple[int, int]
 ) -> ctypes.CDLL:
+    """Return the C of an observer as a loaded library, with a loop over the samples of a record."""
     command = compiler()
     if command is None:
         raise SpecError(
@@ -159,20 +161,21 @@ def _compiled(
             "or clang, or what CC in the environment names). Install one, or leave precision at double.",
             path="precision",
         )
-    given = f"in, in + {nu}" if nu else "in"
+    arguments = f"in, in + {nu}" if nu else "in"
     sizes = {"STATES": str(counts[0]), "FAULTS": str(counts[1]), "TAKEN": str(nu + ny)}
-    harness = filled_template("run_floats.c", prefix, {"ARGUMENTS": given, **sizes})
+    harness = filled_template("run_floats.c", prefix, {"ARGUMENTS": arguments, **sizes})
     own = re.sub(r'^#include ".*"$', '#include "observer.h"', source, count=1, flags=re.MULTILINE)
     texts = {"observer.h": declared, "observer.c": own, "run.c": harness}
     return ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="precision")))
 
 
-def _taken(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> FloatArray:
-    given = np.ascontiguousarray(np.hstack([u, y]), dtype=np.float32)
-    out = np.zeros((len(y), width))
+def _run_in_floats(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> FloatArray:
+    """Return the estimates ``(n, width)`` of the C in single precision over a record."""
+    samples = np.ascontiguousarray(np.hstack([u, y]), dtype=np.float32)
+    estimates = np.zeros((len(y), width))
     count = library.run(
-        given.ctypes.data_as(ctypes.POINTER(ctypes.c_float)),
-        out.ctypes.data_as(ctypes.POINTER(ctypes.c_double)),
+        samples.ctypes.data_as(ctypes.POINTER(ctypes.c_float)),
+        estimates.ctypes.data_as(ctypes.POINTER(ctypes.c_double)),
         len(y),
     )
     if count < len(y):
@@ -181,4 +184,4 @@ def _taken(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> Fl
             "at double.",
             path="precision",
         )
-    return out
+    return estimates

@@ -200,18 +200,22 @@ def export(
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
         alarms = dae_alarms(design, thresholds, warm_up, written)
         return write_dae_c(design, target, sample_time, alarms, numbers, outliers)
-    found = Realisation.of(design, sample_time, numbers)
+    realisation = Realisation.of(design, sample_time, numbers)
     if suffix != ".c":
-        return (write_atomically(target, _array_file(found.as_arrays(), design, suffix)),)
+        return (write_atomically(target, _array_file(realisation.as_arrays(), design, suffix)),)
     if is_window(design):
         _require_own_threshold(monitor, thresholds, warm_up, numbers)
-        return _write_window(found, target, numbers)
-    if found.observer.dt == 0.0:
+        return _write_window(realisation, target, numbers)
+    if realisation.observer.dt == 0.0:
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
         )
-    bound = None if monitor is None or written is not None else registered("bound_of_monitor")(monitor, found.observer)
-    return _write_c(found, target, linear_alarms(found, thresholds, warm_up, written), bound)
+    bound = (
+        None
+        if monitor is None or written is not None
+        else registered("bound_of_monitor")(monitor, realisation.observer)
+    )
+    return _write_c(realisation, target, linear_alarms(realisation, thresholds, warm_up, written), bound)
 
 
 def _checked_target(path: str | Path) -> Path:
@@ -280,10 +284,10 @@ def _write_scheduled(
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 
-def _write_window(found: Realisation, target: Path, numbers: str) -> tuple[Path, ...]:
+def _write_window(realisation: Realisation, target: Path, numbers: str) -> tuple[Path, ...]:
     """Write a guaranteed test as C."""
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
+    source, declared = (in_precision(text, numbers) for text in window_c_texts(realisation, prefix, header.name))
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 
@@ -362,15 +366,17 @@ def exported_files(target: Path) -> dict[Path, FileKind | None]:
     return {target: EXPORTED.get(suffix), **header}
 
 
-def _write_c(found: Realisation, target: Path, alarms: Alarms, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:
+def _write_c(
+    realisation: Realisation, target: Path, alarms: Alarms, bound: AdaptiveBound | None = None
+) -> tuple[Path, ...]:
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
-    source, declared = source_text(found, prefix, header.name, alarms), header_text(found, prefix, alarms)
-    if found.precision != "double":
-        declared = f"{comment(quoted(float_error(found)))}\n{declared}"
-    source, declared = in_precision(source, found.precision), in_precision(declared, found.precision)
+    source, declared = source_text(realisation, prefix, header.name, alarms), header_text(realisation, prefix, alarms)
+    if realisation.precision != "double":
+        declared = f"{comment(quoted(float_error(realisation)))}\n{declared}"
+    source, declared = in_precision(source, realisation.precision), in_precision(declared, realisation.precision)
     if bound is not None:
-        if found.precision != "double":
+        if realisation.precision != "double":
             raise SpecError("Thresholds over tolerances are guaranteed in double precision only.", path="precision")
         begin, end = declared.rsplit("#endif", 1)
         declared = begin + threshold_header(bound, prefix) + "#endif" + end

@@ -17,25 +17,25 @@ MOST_SUMMED_SAMPLES, OVER = 100_000, 1e-9
 MOST_ROUNDS, SETTLED_ERROR = 100, 1e-3
 
 
-def float_bounds(found: Realisation) -> FloatArray | None:
+def float_bounds(realisation: Realisation) -> FloatArray | None:
     """Return a bound on the error of each row of estimates ``(rows,)``, for inputs and outputs whose deviations stay
     within one unit, and samples that are complete; `None` where none is found.
 
     Rounding of n products and of the coefficients is at most ``(n + 2) u`` of the sum of their sizes (Higham 2002,
     lemma 3.1); errors of the state are carried on by ``sum |Az^k|``.
     """
-    observer = found.observer
-    driven = np.abs(np.hstack(list(found.transition.values())[1:])).sum(axis=1)
-    if found.straight:
+    observer = realisation.observer
+    driven = np.abs(np.hstack(list(realisation.transition.values())[1:])).sum(axis=1)
+    if realisation.straight:
         # A rise between samples is at most two units.
-        driven = driven + np.abs(found.transition["rise"]).sum(axis=1)
-    transition, rows = found.transition["z"], np.abs(found.running.Cz)
-    through = np.abs(np.hstack([found.running.Du, found.running.Dy])).sum(axis=1)
+        driven = driven + np.abs(realisation.transition["rise"]).sum(axis=1)
+    transition, rows = realisation.transition["z"], np.abs(realisation.running.Cz)
+    through = np.abs(np.hstack([realisation.running.Du, realisation.running.Dy])).sum(axis=1)
     gathered = _sum_of_powers(transition)
     if gathered is None:
         return None
     # A sum that is not known of all samples is rounded up.
-    size, count = gathered @ driven, observer.order + 2 * len(found.inputs) + 2
+    size, count = gathered @ driven, observer.order + 2 * len(realisation.inputs) + 2
     unit = count * UNIT / (1.0 - count * UNIT)
     error = np.zeros(observer.order)
     for _ in range(MOST_ROUNDS):
@@ -54,21 +54,21 @@ def _sum_of_powers(matrix: FloatArray) -> FloatArray | None:
         with np.errstate(over="ignore", invalid="ignore"):  # an observer that is not stable
             total += np.abs(power)
             power = power @ matrix
-        left = float(np.abs(power).sum(axis=1).max(initial=0.0))
-        if not np.isfinite(left):
+        norm = float(np.abs(power).sum(axis=1).max(initial=0.0))
+        if not np.isfinite(norm):
             return None
-        if left <= OVER:
+        if norm <= OVER:
             # What is left: |A^K| sum |A^k|, which is less than a share OVER of the sum.
             return np.asarray(total * (1.0 + OVER) / (1.0 - OVER) + OVER * np.abs(total).sum())
     return None
 
 
-def float_error(found: Realisation) -> str:
+def float_error(realisation: Realisation) -> str:
     """Return what the header of an export in floats says of its error."""
-    bounds = float_bounds(found)
+    bounds = float_bounds(realisation)
     if bounds is None:
         return "Floats: no bound on the error of single precision was found, as its errors decay too slowly."
-    names = found.observer.row_names
+    names = realisation.observer.row_names
     listed = ", ".join(f"{name} {bound:.2g}" for name, bound in zip(names, bounds, strict=True))
     return (
         "Floats: a derived bound on the error against double precision, for complete samples whose deviations stay "

@@ -48,8 +48,8 @@ class IndependentReport:
 
 def checker_path() -> Path:
     """Return the file of the program; raise `SpecError` where an installation lacks it."""
-    here = Path(__file__).resolve()
-    for place in (here.with_name(CHECKER), here.parents[3] / "checker" / CHECKER):
+    module = Path(__file__).resolve()
+    for place in (module.with_name(CHECKER), module.parents[3] / "checker" / CHECKER):
         if place.is_file():
             return place
     raise SpecError(f"{CHECKER} is not part of this installation: install obsynth again.", path=CHECKER)
@@ -137,6 +137,6 @@ def alarm_proof_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
         "u": Dyadic.of(u.reshape(len(y), -1) if u.size else np.zeros((len(y), 0))).data(),
         "margin": number_data(float(certificate["margin"])),
     }
-    found = proof_of(design)
-    about = f"alarm at row {certificate['row']}, {found['about']}"
-    return {**found, "about": about, "claims": [*found["claims"], claim]}
+    proof = proof_of(design)
+    about = f"alarm at row {certificate['row']}, {proof['about']}"
+    return {**proof, "about": about, "claims": [*proof["claims"], claim]}

@@ -111,7 +111,7 @@ def proof_of(design: ObserverDesign) -> dict[str, Any]:
     proof.collect()
     if not proof.claims:
         raise PreconditionError(
-            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(proof.left)}. "
+            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(proof.not_covered)}. "
             "`obsynth verify` checks it.",
             condition="proof file",
         )
@@ -147,7 +147,7 @@ class _Proof:
 
     design: ObserverDesign
     claims: list[dict[str, Any]] = field(default_factory=list)
-    left: list[str] = field(default_factory=list)
+    not_covered: list[str] = field(default_factory=list)
     witness: dict[str, Any] | None = None
 
     @property
@@ -199,7 +199,7 @@ class _Proof:
             },
             "contraction": self.witness,
             "claims": self.claims,
-            "not_covered": self.left,
+            "not_covered": self.not_covered,
         }
 
     def collect(self) -> None:
@@ -208,18 +208,18 @@ class _Proof:
             for name, claim in test_claims(self.design):
                 self._add(name, claim)
         elif self.model is None:
-            self.left.append("the error system: what the observer follows is not known")
+            self.not_covered.append("the error system: what the observer follows is not known")
         else:
             self._of_the_error_system(self.model)
-        self.left += _NOT_COVERED.get(self.design.method, ["what the method claims by rows of its own"])
+        self.not_covered += _NOT_COVERED.get(self.design.method, ["what the method claims by rows of its own"])
         if self.design.source is not None:
-            self.left.append(
+            self.not_covered.append(
                 "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
             )
 
     def _add(self, name: str, claim: Mapping[str, Any] | None) -> None:
         if claim is None:
-            self.left.append(name)
+            self.not_covered.append(name)
         else:
             self.claims.append(dict(claim))
 
@@ -244,7 +244,7 @@ class _Proof:
     def _add_contraction(self, system: _Exact) -> None:
         contraction_and_witness = system.contraction()
         if contraction_and_witness is None:
-            self.left.append("what rounding of stored numbers adds: no contraction was found")
+            self.not_covered.append("what rounding of stored numbers adds: no contraction was found")
             return
         contraction, self.witness = contraction_and_witness
         self._add("what rounding of stored numbers adds: too much for an estimate", system.rounding_claim(contraction))
@@ -565,8 +565,8 @@ def _shaped(matrix: Any) -> dict[str, Any]:
     return _exact(matrix).data()
 
 
-def _written(found: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value.data() if isinstance(value, Dyadic) else value for name, value in found.items()}
+def _written(claim: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value.data() if isinstance(value, Dyadic) else value for name, value in claim.items()}
 
 
 def _sum(parts: list[Dyadic]) -> Dyadic:
@@ -577,8 +577,8 @@ def _sum(parts: list[Dyadic]) -> Dyadic:
 
 
 def _rows(matrix: Dyadic, rows: Any) -> Dyadic:
-    kept = matrix.integers.tolist()
-    chosen = [kept[i] for i in rows]
+    integers = matrix.integers.tolist()
+    chosen = [integers[i] for i in rows]
     entries = [value for row in chosen for value in row]
     return Dyadic(fmpz_mat(len(chosen), matrix.shape[1], entries), matrix.exponent)
 

@@ -46,7 +46,7 @@ def test_claims(design: ObserverDesign) -> Iterator[tuple[str, dict[str, Any] | 
             yield f"the least threshold{of}: its window has too many equations", _least(test, window)
 
 
-def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row: int) -> dict[str, Any] | None:
+def _threshold(design: ObserverDesign, test: ObserverDesign, window: Window, row: int) -> dict[str, Any] | None:
     threshold = float(test.certificate.claims["threshold"])
     window = window.outer
     exact = exact_test(window, test.certificate.matrices["multipliers"].ravel(), all_columns=threshold == 0.0)
@@ -56,7 +56,7 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
     proved = _largest(window, parts)
     # The exact multipliers are next to the shipped ones: their own threshold may be larger by rounding.
     stated = max(threshold, rounded_outward(proved)) if threshold else 0.0
-    rounding, constant = _rounding(whole, window, exact, row)
+    rounding, constant = _rounding(design, window, exact, row)
     return {
         "claim": "threshold",
         "window": question_of_window(window),
@@ -64,7 +64,7 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
         "threshold": number_data(stated),
         "row": row,
         "rounding": [number_data(value) for value in rounding],
-        "constant": number_data(float(whole.linear[1].added[row])),
+        "constant": number_data(float(design.linear[1].added[row])),
         "constant_rounding": number_data(constant),
     }
 
@@ -125,8 +125,8 @@ def question_of_window(window: Window) -> dict[str, Any]:
             "fault_rate": [_bound(question.fault_rate)],
         },
         "middles": {
-            kind: [number_data(float(value)) for value in (np.zeros(counts[kind]) if given is None else given)]
-            for kind, given in middles.items()
+            kind: [number_data(float(value)) for value in (np.zeros(counts[kind]) if middle is None else middle)]
+            for kind, middle in middles.items()
         },
     }
 
@@ -145,10 +145,10 @@ def _between_samples(window: Window) -> dict[str, Any] | None:
 
 def exact_test(window: Window, multipliers: FloatArray, *, all_columns: bool = False) -> list[Fraction] | None:
     """Return fractions next to multipliers: theta has weight one, every free column zero; ``None``: not found."""
-    told = [0, *(range(1, len(window.bar)) if all_columns else np.flatnonzero(window.free).tolist())]
-    seen = _transposed_product(window, [Fraction(float(value)) for value in multipliers])
-    missing = [Fraction(int(column == 0)) - seen[column] for column in told]
-    return _next_to(window.matrix[:, told].toarray().T, multipliers, missing, _entries(window, told, columns=True))
+    chosen = [0, *(range(1, len(window.bar)) if all_columns else np.flatnonzero(window.free).tolist())]
+    products = _transposed_product(window, [Fraction(float(value)) for value in multipliers])
+    missing = [Fraction(int(column == 0)) - products[column] for column in chosen]
+    return _next_to(window.matrix[:, chosen].toarray().T, multipliers, missing, _entries(window, chosen, columns=True))
 
 
 def exact_point(window: Window, point: FloatArray) -> list[Fraction] | None:
@@ -185,12 +185,12 @@ def _next_to(
         return None
     fractions = [Fraction(float(value)) for value in values]
     added = dict(zip(columns, step, strict=True))
-    kept = set(rows)
+    solved_rows = set(rows)
     sums = [Fraction(0)] * len(matrix)
     for (i, j), entry in exact.items():
-        if i not in kept and j in added:
+        if i not in solved_rows and j in added:
             sums[i] += entry * added[j]
-    if any(sums[i] != missing[i] for i in range(len(matrix)) if i not in kept):
+    if any(sums[i] != missing[i] for i in range(len(matrix)) if i not in solved_rows):
         return None
     for column, value in added.items():
         fractions[column] += value
@@ -203,9 +203,9 @@ def _exact_entries(window: Window) -> Iterator[tuple[int, int, Fraction]]:
         yield i, j, Fraction(value) * times
 
 
-def _entries(window: Window, told: list[int], *, columns: bool) -> dict[tuple[int, int], Fraction]:
+def _entries(window: Window, chosen: list[int], *, columns: bool) -> dict[tuple[int, int], Fraction]:
     """Return exact entries: of some columns, transposed, or of some rows."""
-    place = {number: k for k, number in enumerate(told)}
+    place = {number: k for k, number in enumerate(chosen)}
     entries: dict[tuple[int, int], Fraction] = {}
     for i, j, entry in _exact_entries(window):
         key = (place.get(j), i) if columns else (place.get(i), j)
@@ -248,9 +248,11 @@ def _excess(window: Window, point: list[Fraction]) -> Fraction:
     return max([worst, *(Fraction(root_above(value)) for value in groups.values())])
 
 
-def _rounding(whole: ObserverDesign, window: Window, multipliers: list[Fraction], row: int) -> tuple[FloatArray, float]:
+def _rounding(
+    design: ObserverDesign, window: Window, multipliers: list[Fraction], row: int
+) -> tuple[FloatArray, float]:
     """Return how far the weights that run are from exact ones, summed over samples, and the constant from its own."""
-    observer, plant = whole.linear[1], window.plant
+    observer, plant = design.linear[1], window.plant
     exact = _Weights(window, multipliers)
     response = [Dyadic.of(observer.Du[[row]]), Dyadic.of(observer.Dy[[row]])]
     state, (az, bu, by) = Dyadic.of(observer.Cz[[row]]), (Dyadic.of(m) for m in (observer.Az, observer.Bu, observer.By))

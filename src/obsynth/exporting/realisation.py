@@ -34,13 +34,13 @@ STEADY = (
 
 
 class GapTables(NamedTuple):
-    """What stands in for the sensors where a sample is missing: the model of the plant, as runs have it."""
+    """Sizes and matrices of the plant's model, which replaces the sensors where a sample is missing, as on logs."""
 
     faults: int  # of the plant
-    told: tuple[int, ...]  # which of them the observer estimates
+    estimated: tuple[int, ...]  # which of them the observer estimates
     kept_inputs: int = 1
     states: int = 0
-    seen: int = 0
+    known_states: int = 0
     exists: bool = False
     solved: bool = False
     tables: Mapping[str, FloatArray] = MappingProxyType({})
@@ -70,10 +70,10 @@ class Realisation:
                     "without, or run it with obsynth run.",
                     path="outliers",
                 )
-            found = steady_observer(design.observer)
+            steady = steady_observer(design.observer)
             if sample_time is not None:
                 raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
-            return cls(design, found.observer, digest, found.start, STEADY, precision)
+            return cls(design, steady.observer, digest, steady.start, STEADY, precision)
         if isinstance(design.observer, DAEObserver):
             raise SpecError(
                 f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
@@ -97,13 +97,13 @@ class Realisation:
 
     @property
     def running(self) -> LinearObserver:
-        """The observer whose rows are said: a continuous one as it is, whose state a run starts at zero."""
+        """The observer whose output matrices are used: a continuous one unsampled, whose state a run starts at zero."""
         return self.design.linear[1] if self.straight else self.observer
 
     @cached_property
     def transition(self) -> dict[str, FloatArray]:
-        """What makes z of a sample from that of the one before: of inputs and outputs there, or of these before and
-        their rise, where lines between them are straight."""
+        """Matrices of one step of z: of inputs and outputs at the sample before, or of these and of their rise, where
+        signals are straight lines between samples."""
         if not self.straight:
             return {"z": self.observer.Az, "u": self.observer.Bu, "y": self.observer.By}
         driven = np.hstack([self.running.Bu, self.running.By])
@@ -124,9 +124,9 @@ class Realisation:
         solver = state_solver(self.design.replace(plant=plant, observer=self.running))
         missing = MissingSamples(plant, self.running, solver)
         model = missing.model
-        told = tuple(missing.estimated_faults)
+        estimated = tuple(missing.estimated_faults)
         if model is None:
-            return GapTables(plant.nf, told)
+            return GapTables(plant.nf, estimated)
         moving = model.plant
         if self.straight:
             held = first_order_hold(moving.A, np.hstack([moving.B, moving.Bf]), observer.dt)
@@ -145,13 +145,13 @@ class Realisation:
             tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": solver}
         kept = missing.kept_inputs
         return GapTables(
-            plant.nf, told, kept, moving.nx, missing.known_states, True, solver is not None, tables,
+            plant.nf, estimated, kept, moving.nx, missing.known_states, True, solver is not None, tables,
             GAP_LEFT_SHARE, LEAST_SHOWN,
         )  # fmt: skip
 
     @property
     def mark(self) -> str:
-        """What every file says of a design that fails its verification; empty where it holds."""
+        """The mark in every file of a design that fails its verification; empty where it holds."""
         return unverified_mark(self.design.report)
 
     @property
