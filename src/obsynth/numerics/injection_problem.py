@@ -82,6 +82,7 @@ class GainProblem:
     _modes: WeakKeyDictionary[Injection, Modes] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
     _radii: WeakKeyDictionary[Injection, float] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
     _gains: WeakKeyDictionary[Injection, float] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
+    _variances: WeakKeyDictionary[Injection, float] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
 
     @property
     def order(self) -> int:
@@ -135,7 +136,10 @@ class GainProblem:
 
     def noise_variance(self, solution: Injection) -> float:
         """Return the true total variance of xi under the noise of the problem, with the given gains."""
-        return float(np.trace(output_covariance(*self.noise_as_disturbance().closed_loop(solution))))
+        if solution not in self._variances:
+            covariance = output_covariance(*self.noise_as_disturbance().closed_loop(solution))
+            self._variances[solution] = float(np.trace(covariance))
+        return self._variances[solution]
 
     def modes(self, solution: Injection) -> Modes:
         """Return the modes of the closed loop; those of the last filter are kept."""

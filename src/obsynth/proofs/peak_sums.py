@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only, remembered
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
 from obsynth.proofs.contraction import (
@@ -189,6 +189,24 @@ def absolute_gains(
 
     ``b`` are the unit vectors, or ``columns (n, m)``.  Bounds hang on the contraction by what is left of the sum alone:
     where it settles, by `LEFT_OF_GAINS` at most, of given columns by `LEFT_OF_SUM`."""
+    if columns is not None:
+        return _absolute_gains(a, rows, contraction, columns)
+    # The same sums are asked for on the way to several rows of a report.
+    known = _known_gains(contraction)
+    for matrix, others, gains in known:
+        if np.array_equal(matrix, a) and np.array_equal(others, rows):
+            return gains
+    known.append((a, rows, read_only(_absolute_gains(a, rows, contraction, None))))
+    return known[-1][2]
+
+
+@remembered
+def _known_gains(_contraction: Contraction) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return matrices, rows and sums of unit vectors under a contraction, as far as they were asked for."""
+    return []
+
+
+def _absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction, columns: Ball | None) -> FloatArray:
     n, has_columns = len(a), columns is not None
     into = Ball.exact(np.eye(n)) if columns is None else columns
     loose = contraction.gain(rows, into.midpoint, into.radius)

@@ -61,6 +61,7 @@ class Goal:
     gain: float
     slowest: float
     judged: dict[int, tuple[Injection, bool]] = field(default_factory=dict, repr=False)
+    mixtures: dict[tuple[bytes, ...], Injection] = field(default_factory=dict, repr=False)
 
     @property
     def noisy(self) -> bool:
@@ -81,6 +82,11 @@ class Goal:
             )
             self.judged[id(injection)] = (injection, reached)
         return self.judged[id(injection)][1]
+
+    def mixture(self, one: Injection, other: Injection, share: float) -> Injection:
+        """Return the filter between two, the same object for the same gains, so that it is judged once."""
+        gains = [(1.0 - share) * a + share * b for a, b in zip(one.parts, other.parts, strict=True)]
+        return self.mixtures.setdefault(tuple(part.tobytes() for part in gains), Injection(*gains))
 
     def is_fast(self, injection: Injection) -> bool:
         """Return whether the filter decays fast enough."""
@@ -266,7 +272,7 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
     many = COARSE_LINE_STEPS if goal.problem.order <= HIGHER_LEVEL_UP_TO else COARSEST_LINE_STEPS
     for _ in range(LINE_STEPS - (not goal.noisy) if few else many):
         tried = share + step
-        mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
+        mixed = goal.mixture(injection, target, tried)
         if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:
             best, least, share = mixed, cost, tried
         step *= 0.5
