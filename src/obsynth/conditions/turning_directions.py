@@ -99,10 +99,10 @@ def turning_faults(plant: PolytopicSystem, *, decay: float = 1.0) -> Conditions:
             constraints[f"stable{name}"] = lmi.at_least(lmi.symmetric_blocks([[decay**2 * P], [moved, P]]), room)
 
     def gains(_: Values) -> dict[str, FloatArray]:
-        found = np.asarray(P.value)
-        found = 0.5 * (found + found.T)
-        K = _exactly_decoupled([np.linalg.solve(found, np.asarray(y.value)) for y in Y], C, TB)
-        return {"T": T, "N": N, "P": found} | {f"K[{i + 1}]": each for i, each in enumerate(K)}
+        P_value = np.asarray(P.value)
+        P_value = 0.5 * (P_value + P_value.T)
+        K = _exactly_decoupled([np.linalg.solve(P_value, np.asarray(y.value)) for y in Y], C, TB)
+        return {"T": T, "N": N, "P": P_value} | {f"K[{i + 1}]": each for i, each in enumerate(K)}
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
         raise SpecError(

@@ -77,13 +77,13 @@ def product_coefficients(degree: int, pieces: int) -> list[ProductCoefficient]:
             slope[i, i + 1] += d - i
             slope[i, i] -= d - i
     ends = np.column_stack([d + 1 - k, k]).astype(np.float64)
-    found = []
+    coefficients = []
     for piece in range(pieces):
         for place, row in enumerate(_subdivision(d + 1, piece, pieces)):
             weights = row @ low, row @ high, row @ (low + high) @ slope, row @ ends
             where = f"piece {piece + 1} of {pieces}, coefficient {place + 1}"
-            found.append(ProductCoefficient(*weights, float(d + 1), where))
-    return found
+            coefficients.append(ProductCoefficient(*weights, float(d + 1), where))
+    return coefficients
 
 
 def coefficients_on_pieces(degree: int, pieces: int) -> list[tuple[str, FloatArray]]:

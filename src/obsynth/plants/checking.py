@@ -84,8 +84,8 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
     """Return the number of signals of each kind, from the first matrix that tells."""
 
     def columns(*names: str) -> int:
-        found = (given.get(name) for name in names)
-        return next((m.shape[1] for m in found if m is not None and 0 not in m.shape), 0)
+        matrices = (given.get(name) for name in names)
+        return next((m.shape[1] for m in matrices if m is not None and 0 not in m.shape), 0)
 
     outputs = given.get("C")
     counts = {signal: columns(*names) for signal, names in COUNTED_BY.items()}

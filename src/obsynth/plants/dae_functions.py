@@ -39,8 +39,8 @@ class Compiled:
 
     def __init__(self, function: Any) -> None:
         # CasADi's own annotations of these two do not fit what they return.
-        found: Any = function.buffer()
-        self._buffer, self._run = found
+        buffer_and_run: Any = function.buffer()
+        self._buffer, self._run = buffer_and_run
         self._returned = self._buffer.ret
         self._sizes = [function.numel_in(i) for i in range(function.n_in())]
         self._arguments = [np.zeros(max(size, 1)) for size in self._sizes]
@@ -163,8 +163,8 @@ def local_equations(
     model: DAEModel, rates: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray
 ) -> LocalEquations:
     """Return the equations at derivatives ``(nx,)``, states ``(nx,)``, inputs ``(nu,)`` and parameters ``(nq,)``."""
-    found = [np.array(part.full()) for part in symbolic_equations(model)(rates, x, u, theta)]
-    value, E, by_state, by_input, by_parameter, y, C, outputs_by_parameter = found
+    values = [np.array(part.full()) for part in symbolic_equations(model)(rates, x, u, theta)]
+    value, E, by_state, by_input, by_parameter, y, C, outputs_by_parameter = values
     return LocalEquations(value[:, 0], E, by_state, by_input, by_parameter, y[:, 0], C, outputs_by_parameter)
 
 

@@ -33,7 +33,7 @@ WHOLE_SAMPLES = 1e-9
 def checked_delays(given: Any, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, float]:
     """Return dead times in seconds by input or output, without those that are zero."""
     require_mapping(given, "delays")
-    found, both = {}, set(inputs) & set(outputs)
+    delays, both = {}, set(inputs) & set(outputs)
     for name, value in (given or {}).items():
         if name in both:
             raise SpecError(
@@ -48,8 +48,8 @@ def checked_delays(given: Any, inputs: Sequence[str], outputs: Sequence[str]) ->
             )
         seconds = seconds_of(value, f"delays[{name!r}]")
         if seconds:
-            found[str(name)] = seconds
-    return found
+            delays[str(name)] = seconds
+    return delays
 
 
 def seconds_of(value: Any, name: str) -> float:

@@ -253,11 +253,11 @@ class DescriptorSystem:
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it; `delays`, `uncertainty` and `exact` only where there are
         such."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        data = {field.name: getattr(self, field.name) for field in fields(self)}
         if not self.delays:
-            found.pop("delays")
-        records = {name: found.pop(name) for name in ("uncertainty", "exact")}
-        return found | {name: record.as_dict() for name, record in records.items() if record is not None}
+            data.pop("delays")
+        records = {name: data.pop(name) for name in ("uncertainty", "exact")}
+        return data | {name: record.as_dict() for name, record in records.items() if record is not None}
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.

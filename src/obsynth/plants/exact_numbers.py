@@ -109,5 +109,5 @@ def _text(value: Fraction) -> str:
 def _fraction(text: str) -> Fraction:
     from flint import fmpq
 
-    found = fmpq(text)
-    return Fraction(int(found.p), int(found.q))
+    rational = fmpq(text)
+    return Fraction(int(rational.p), int(rational.q))

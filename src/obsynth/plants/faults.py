@@ -50,8 +50,8 @@ def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
     for part in range(count):
         block = phi[np.ix_(parts == part, parts == part)]
         triangular = not np.any(np.tril(block, -1))
-        found = np.unique(np.diag(block)) if triangular else distinct_eigenvalues(block, MULTIPLE_EIGENVALUE)
-        values += [complex(value) for value in found if complex(value) not in values]
+        of_block = np.unique(np.diag(block)) if triangular else distinct_eigenvalues(block, MULTIPLE_EIGENVALUE)
+        values += [complex(value) for value in of_block if complex(value) not in values]
     return np.array(values, dtype=np.complex128)
 
 
@@ -59,15 +59,15 @@ def distinct_eigenvalues(matrix: FloatArray, tolerance: float) -> ComplexArray:
     """Return each eigenvalue once; those within ``tolerance`` times the balanced norm count as one, at their mean."""
     balanced = balanced_transition(matrix)[0]
     reach = tolerance * largest_singular_value(balanced)
-    found: list[complex] = []
+    distinct: list[complex] = []
     waiting = [complex(value) for value in np.linalg.eigvals(balanced)]
     while waiting:
         near = [value for value in waiting if abs(value - waiting[0]) <= reach]
         waiting = [value for value in waiting if abs(value - waiting[0]) > reach]
         mean = sum(near) / len(near)
         # A cluster that scatters around the real axis is a real eigenvalue.
-        found.append(complex(mean.real, 0.0) if abs(mean.imag) <= reach else mean)
-    return np.array(found, dtype=np.complex128)
+        distinct.append(complex(mean.real, 0.0) if abs(mean.imag) <= reach else mean)
+    return np.array(distinct, dtype=np.complex128)
 
 
 def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

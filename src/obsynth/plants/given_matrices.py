@@ -87,23 +87,26 @@ def _without_frames(
 
 def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what: str) -> list[int]:
     """Return the positions of labels in the order of the names known so far, which they define where there are none."""
-    found = list(labels)
-    if not found or not all(isinstance(label, str) for label in found):
-        return list(range(len(found)))
-    repeated = sorted({label for label in found if found.count(label) > 1})
+    own_labels = list(labels)
+    if not own_labels or not all(isinstance(label, str) for label in own_labels):
+        return list(range(len(own_labels)))
+    repeated = sorted({label for label in own_labels if own_labels.count(label) > 1})
     if repeated:
         raise SpecError(f"{what[0].upper()}{what[1:]} repeat the label {repeated[0]!r}.", path=kind)
     if known.get(kind) is None:
-        known[kind] = found
+        known[kind] = own_labels
     wanted = list(known[kind] or ())
-    missing, foreign = [name for name in wanted if name not in found], [name for name in found if name not in wanted]
+    missing, foreign = (
+        [name for name in wanted if name not in own_labels],
+        [name for name in own_labels if name not in wanted],
+    )
     if missing or foreign:
         texts = [f"lack {', '.join(map(repr, missing))}"] if missing else []
         texts += [f"have {', '.join(map(repr, foreign))}"] if foreign else []
         raise SpecError(
             f"{what[0].upper()}{what[1:]} {' and '.join(texts)}: the {kind} are {', '.join(wanted)}.", path=kind
         )
-    return [found.index(name) for name in wanted]
+    return [own_labels.index(name) for name in wanted]
 
 
 def plant_fields(
@@ -212,7 +215,7 @@ def _with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
     """Append a column to Df, Bf (Dd, Bd) in ``given`` for each sensor that Df (Dd) names; return these."""
-    found = {}
+    picks = {}
     for name, beside in SENSOR_PICKS.items():
         picked = asked[name]
         if not is_name_list(picked):
@@ -222,8 +225,8 @@ def _with_sensor_picks(
         dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
         given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
         given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
-        found[name] = tuple(picked)
-    return found
+        picks[name] = tuple(picked)
+    return picks
 
 
 def _noise_of_sensors(

@@ -109,10 +109,10 @@ def seconds(value: Any, path: str) -> float:
     """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
     # Both signs of micro, that of keyboards and the Greek letter, are spelled with a u.
     text = re.sub("[\u00b5\u03bc]s", "us", value) if isinstance(value, str) else ""
-    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", text)
-    if found is not None and found[2] in SECONDS_OF_UNITS:
+    match = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", text)
+    if match is not None and match[2] in SECONDS_OF_UNITS:
         try:
-            return stated_number(float(found[1]) * SECONDS_OF_UNITS[found[2]], path)
+            return stated_number(float(match[1]) * SECONDS_OF_UNITS[match[2]], path)
         except ValueError:
             pass
     return stated_number(value, path)
@@ -131,12 +131,12 @@ def stated_number(value: Any, path: str) -> float:
 def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:
     """Return the noise of each sensor of which something is stated."""
     require_mapping(given, "sensor_noise")
-    found = {}
+    noises = {}
     for name, item in (given or {}).items():
         index_of(name, outputs, what="sensor_noise")
         path = f"sensor_noise.{name}"
         if not isinstance(item, Mapping):
-            found[name] = SensorNoise(0.0, 0.0, stated_number(item, path))
+            noises[name] = SensorNoise(0.0, 0.0, stated_number(item, path))
             continue
         wrong = [key for key in item if key not in ("deviation", "correlation", "white")]
         if wrong or "deviation" not in item:
@@ -144,12 +144,12 @@ def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> di
             raise SpecError(f"{path} {told}: it takes deviation, correlation and white.", path=path)
         deviation = stated_number(item["deviation"], f"{path}.deviation")
         if item.get("correlation") is None:
-            found[name] = SensorNoise(0.0, 0.0, deviation)
+            noises[name] = SensorNoise(0.0, 0.0, deviation)
             continue
         white = item.get("white")
-        found[name] = SensorNoise(
+        noises[name] = SensorNoise(
             deviation,
             seconds(item["correlation"], f"{path}.correlation"),
             DEFAULT_WHITE_SHARE * deviation if white is None else stated_number(white, f"{path}.white"),
         )
-    return found
+    return noises

@@ -94,7 +94,7 @@ class OperatingRegion:
         PreconditionError
             A slope is not bounded, or a nonlinearity jumps.
         """
-        found = []
+        slopes = []
         for place, nonlinearity in enumerate(self.terms.nonlinearities):
             box = {f"{ARGUMENT}{j}": tuple(map(float, self.arguments[j])) for j in nonlinearity.arguments}
             for j in nonlinearity.arguments:
@@ -109,8 +109,8 @@ class OperatingRegion:
                         self.in_signals(f"The slope of {nonlinearity.expression.text} is not bounded over the region."),
                         condition="boundedness",
                     )
-                found.append(Slope(place, j, slope.low, slope.high))
-        return tuple(found)
+                slopes.append(Slope(place, j, slope.low, slope.high))
+        return tuple(slopes)
 
     def in_signals(self, text: str) -> str:
         """Return a text with what each argument is."""
@@ -137,14 +137,14 @@ class OperatingRegion:
 
     def measured(self) -> tuple[tuple[int, int, float], ...]:
         """Return which ranges an output shows: the number of the range, that of the output, and its constant."""
-        terms, found = self.terms, []
+        terms, measured = self.terms, []
         states, inputs, _ = self.matrices()
         for place in range(len(states)):
             for output in range(len(terms.output_names)):
                 same = np.array_equal(terms.C[output], states[place]) and not inputs[place].any()
                 if same and not terms.Wy[output].any():
-                    found.append((place, output, float(terms.c_y[output])))
-        return tuple(found)
+                    measured.append((place, output, float(terms.c_y[output])))
+        return tuple(measured)
 
 
 def _range(text: str, ends: Any, known: Sequence[str]) -> RangeOfCombination:
@@ -162,8 +162,8 @@ def _range(text: str, ends: Any, known: Sequence[str]) -> RangeOfCombination:
 
 def _down(value: Fraction) -> float:
     """Return the largest double that is not above a rational."""
-    found = float(value)
-    return found if Fraction(found) <= value else float(np.nextafter(found, -np.inf))
+    nearest = float(value)
+    return nearest if Fraction(nearest) <= value else float(np.nextafter(nearest, -np.inf))
 
 
 def _argument_range(argument: LinearCombination, ranges: Sequence[RangeOfCombination]) -> tuple[float, float]:

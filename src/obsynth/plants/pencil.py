@@ -36,6 +36,6 @@ def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
 @remembered
 def structure_of(plant: DescriptorSystem) -> PencilStructure:
     """Return the structure of a plant's pencil ``A - z E``, which methods and verification ask for again and again."""
-    found = structure_of_reduced(plant.E.shape, _reduced(plant))
-    values = PlantUnits.of(plant).rounded().eigenvalues(found.finite_eigenvalues)
-    return replace(found, finite_eigenvalues=read_only(values, np.complex128))
+    structure = structure_of_reduced(plant.E.shape, _reduced(plant))
+    values = PlantUnits.of(plant).rounded().eigenvalues(structure.finite_eigenvalues)
+    return replace(structure, finite_eigenvalues=read_only(values, np.complex128))

@@ -79,8 +79,8 @@ class PlantUnits:
             for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
         ]
         courses = _model_units(model, factors[fault_model], entering[0])
-        found = (factors[equations], own, shown, *entering, courses)
-        parts = {kind: read_only(part) for kind, part in zip(_SIGNAL_KINDS, found, strict=True)}
+        units = (factors[equations], own, shown, *entering, courses)
+        parts = {kind: read_only(part) for kind, part in zip(_SIGNAL_KINDS, units, strict=True)}
         return cls(time=plant.dt or float(factors[0]), discrete=plant.is_discrete, **parts)
 
     @property
@@ -211,21 +211,21 @@ def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
 
 def _inverse_sizes(*parts: FloatArray) -> FloatArray:
     """Return the inverse length of each row of the first part in which it is not zero; 1 where it is in none."""
-    found = np.zeros(len(parts[0]))
+    lengths = np.zeros(len(parts[0]))
     for part in parts:
-        found = np.where(found > 0.0, found, np.linalg.norm(part, axis=1))
-    return np.asarray(1.0 / np.where(found > 0.0, found, 1.0))
+        lengths = np.where(lengths > 0.0, lengths, np.linalg.norm(part, axis=1))
+    return np.asarray(1.0 / np.where(lengths > 0.0, lengths, 1.0))
 
 
 def _model_units(model: Exosystem | None, factors: FloatArray, faults: FloatArray) -> FloatArray:
     """Return the factors of the states of the fault model, such that the rows of Cw have unit length for each fault."""
     if model is None:
         return factors
-    found, links = factors.copy(), model.Phi != 0.0
+    units, links = factors.copy(), model.Phi != 0.0
     for fault, row in zip(faults, model.Cw, strict=True):
         linked = row != 0.0
         for _ in range(model.order):
             linked = linked | np.any(links[linked], axis=0) | np.any(links[:, linked], axis=1)
         size = float(np.linalg.norm(row * factors))
-        found[linked] = factors[linked] * (fault / size if size > 0.0 else 1.0)
-    return found
+        units[linked] = factors[linked] * (fault / size if size > 0.0 else 1.0)
+    return units

@@ -131,18 +131,18 @@ class Scheduling:
     def bounds(self) -> FloatArray:
         """``(q, 2)``: ends of the range of every function over the region, enclosed with outward rounding."""
         box = {name: (float(a), float(b)) for name, a, b in zip(self.names, self.low, self.high, strict=True)}
-        found = []
+        ranges = []
         for expression in self.expressions:
             if expression.text in box:
-                found.append(box[expression.text])
+                ranges.append(box[expression.text])
                 continue
             known = range_over(expression, box)
             if not known.low < known.high:
                 raise PreconditionError(
                     f"{expression.text!r} is the same everywhere in the region: write its value.", condition="range"
                 )
-            found.append((known.low, known.high))
-        return read_only(np.array(found, dtype=np.float64).reshape(len(found), 2))
+            ranges.append((known.low, known.high))
+        return read_only(np.array(ranges, dtype=np.float64).reshape(len(ranges), 2))
 
     @cached_property
     def corners(self) -> FloatArray:
@@ -172,10 +172,10 @@ class Scheduling:
                     path="scheduling",
                 )
             given = [given[name] for name in self.names]
-        found = np.asarray(given, dtype=np.float64).ravel()
-        if found.shape != (len(self.names),):
+        values = np.asarray(given, dtype=np.float64).ravel()
+        if values.shape != (len(self.names),):
             raise SpecError(f"Give {len(self.names)} scheduling parameters.", path="scheduling")
-        return found
+        return values
 
     def is_inside(self, values: FloatArray) -> bool:
         """Whether parameters ``(p,)`` are all there and in the region."""
@@ -293,7 +293,7 @@ def parameters_of(given: Any) -> dict[str, dict[str, Any]]:
     """Return scheduling parameters as ``{name: {range, rate, column, unit}}``; raise `SpecError` for anything else."""
     if not isinstance(given, Mapping) or not given:
         raise SpecError("scheduling must name one or more parameters, such as {v: {range: [1, 3]}}.", path="scheduling")
-    found = {}
+    checked = {}
     for name, entry in given.items():
         path = f"scheduling.{name}"
         entry = entry if isinstance(entry, Mapping) else {"range": entry}
@@ -312,8 +312,8 @@ def parameters_of(given: Any) -> dict[str, dict[str, Any]]:
             )
         _require_range(str(name), *map(float, ends))
         _require_rate(str(name), entry.get("rate"))
-        found[str(name)] = {**entry, "range": [float(ends[0]), float(ends[1])]}
-    return found
+        checked[str(name)] = {**entry, "range": [float(ends[0]), float(ends[1])]}
+    return checked
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,11 +123,11 @@ class MatrixSequence:
         matrix = np.array(self.still)
         for i, j in self.moving:
             matrix[i, j] = (self.entries or ())[i][j](values)
-        found = as_matrix(matrix, f"{self.name}({k})")
+        checked = as_matrix(matrix, f"{self.name}({k})")
         # Design, checks and runs ask for the same k many times; what does not fit is computed again.
         if len(self.computed) * matrix.size < MOST_KEPT_ENTRIES:
-            self.computed[k] = found
-        return found
+            self.computed[k] = checked
+        return checked
 
     def as_data(self) -> Any:
         """Return an array or rows of texts."""

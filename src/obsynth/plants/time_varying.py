@@ -129,15 +129,15 @@ class TimeVaryingDescriptorSystem:
         known = problems.collect(lambda: checked_constants(constants))
         problems.raise_if_any()
         asked = {"E": E, "A": A, "B": B, "C": C, "Phi": Phi, "Psi": Psi, "D": D}
-        found: dict[str, MatrixSequence | None] = {}
+        sequences: dict[str, MatrixSequence | None] = {}
         for name, _, _, first in LAYOUT:
             if asked[name] is not None:
                 make = partial(MatrixSequence.of, asked[name], name, first=first, constants=known)
-                found[name] = problems.collect(make)
+                sequences[name] = problems.collect(make)
             elif name in ("A", "C"):
                 problems.note(f"{name} is missing: a plant needs A and C.", name)
         problems.raise_if_any()
-        values = completed(found, problems)
+        values = completed(sequences, problems)
         problems.raise_if_any()
         sizes = {
             "x": values["A"].shape[1],

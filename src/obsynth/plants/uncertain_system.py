@@ -113,9 +113,9 @@ def uncertain_system(
         arguments, entries = dict(plant), {}
         for name in UNCERTAIN_MATRICES:
             if arguments.get(name) is not None:
-                arguments[name], found = expressions_in(arguments[name])
-                if found:
-                    entries[name] = found
+                arguments[name], written = expressions_in(arguments[name])
+                if written:
+                    entries[name] = written
         try:
             system = DescriptorSystem(arguments.pop("E", None), arguments.pop("A"), **arguments)
         except KeyError as error:
@@ -165,7 +165,7 @@ def _with_tolerances(
 ) -> DescriptorSystem:
     """Return a plant that has constants with new tolerances of these; nominal values may not move."""
     written = as_written(plant, before)
-    entries = {name: list(found) for name, found in before.entries.items()}
+    entries = {name: list(items) for name, items in before.entries.items()}
     stated = {key: value for key, value in options.items() if value is not None}
     variation = constants.variation if isinstance(constants, ConstantsBox) else before.box.variation
     kept = {"variation": variation, **_kept_source(before.box, constants, stated), **stated}
@@ -233,7 +233,7 @@ def _boxed(
         }
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
-    found, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
+    boxed, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
     # A capacitance may be called C: what an expression names is a constant, and no tolerance of that matrix.
     texts = [
         text for matrix, given in entries.items() for row, column, text in given if text != _entry(matrix, row, column)
@@ -243,7 +243,7 @@ def _boxed(
         if name in UNCERTAIN_MATRICES and name not in {*known, *named} and isinstance(value, (str, int, float)):
             shares.setdefault(name, value)
         else:
-            found[name] = value
+            boxed[name] = value
     for matrix, value in shares.items():
         if matrix not in UNCERTAIN_MATRICES:
             raise SpecError(
@@ -257,10 +257,10 @@ def _boxed(
             if (row, column) in taken:
                 continue
             name, number = _entry(matrix, row, column), float(matrices[matrix][row, column])
-            found[name] = constant_of(name, {"nominal": number, "tolerance": share})
+            boxed[name] = constant_of(name, {"nominal": number, "tolerance": share})
             if name not in present:
                 more.setdefault(matrix, []).append((row, column, name))
-    return constants_box(found, known=known, **options), more
+    return constants_box(boxed, known=known, **options), more
 
 
 def _entry(matrix: str, row: int, column: int) -> str:

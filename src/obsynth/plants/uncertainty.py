@@ -67,14 +67,14 @@ class Uncertainty:
     _parsed: dict[str, Expression] = field(default_factory=dict, repr=False, init=False)
 
     def __post_init__(self) -> None:
-        found: dict[str, tuple[Entry, ...]] = {}
+        checked: dict[str, tuple[Entry, ...]] = {}
         for matrix, entries in self.entries.items():
             if matrix not in UNCERTAIN_MATRICES:
                 raise SpecError(f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=matrix)
-            found[matrix] = tuple((int(row), int(column), str(text)) for row, column, text in entries)
-            for row, column, text in found[matrix]:
+            checked[matrix] = tuple((int(row), int(column), str(text)) for row, column, text in entries)
+            for row, column, text in checked[matrix]:
                 self._check(text, f"{matrix}, row {row + 1}, column {column + 1}", matrix)
-        object.__setattr__(self, "entries", MappingProxyType(found))
+        object.__setattr__(self, "entries", MappingProxyType(checked))
         object.__setattr__(self, "steps", tuple((str(kind), float(size)) for kind, size in self.steps))
         object.__setattr__(self, "written", None if self.written is None else MappingProxyType(dict(self.written)))
 
@@ -170,11 +170,11 @@ class Uncertainty:
         values : mapping
             Of all constants.
         """
-        found = {name: np.array(matrices[name], dtype=np.float64) for name in UNCERTAIN_MATRICES}
+        filled = {name: np.array(matrices[name], dtype=np.float64) for name in UNCERTAIN_MATRICES}
         for name, entries in self.entries.items():
             for row, column, text in entries:
-                found[name][row, column] = self.value(text, values)
-        return found
+                filled[name][row, column] = self.value(text, values)
+        return filled
 
     def affine(self, matrices: Mapping[str, FloatArray], box: ConstantsBox) -> dict[str, AffineMatrix]:
         """Return the matrices over a box of the constants.
@@ -202,19 +202,19 @@ class Uncertainty:
             slack = 0.0 if item.certain else HALVING * max(abs(item.low), abs(item.high))
             numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
         known = dict(numbers)
-        found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
+        families = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
         for name, entries in self.entries.items():
-            at = found[name]
+            at = families[name]
             for row, column, text in entries:
                 if text not in known:
                     known[text] = zero.lifted(self._parsed[text].translated(numbers, translation))
                 value, place = known[text], (row, column)
                 at.center[place], at.parts[:, row, column], at.radius[place] = value.center, value.parts, value.radius
-        return found
+        return families
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `uncertainty_of` reads it."""
-        entries = {name: [list(item) for item in found] for name, found in self.entries.items()}
+        entries = {name: [list(item) for item in items] for name, items in self.entries.items()}
         written = None if self.written is None else dict(self.written)
         plain = {
             "box": self.box.as_dict(),

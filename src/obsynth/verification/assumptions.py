@@ -75,26 +75,26 @@ class Assumptions:
 
     def parts(self) -> list[str]:
         """Return one phrase for each kind of bound."""
-        found, plant = [], self.plant
+        phrases, plant = [], self.plant
         each = [
             f"{name} within {shown(bound, plant.units.get(name, ''))}"
             for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)
             if np.isfinite(bound)  # others reach nothing that is watched
         ]
         if each:
-            found.append(_enough(each, "disturbances within their bounds"))
+            phrases.append(_enough(each, "disturbances within their bounds"))
         if plant.nw:
-            found.append(self._noise())
+            phrases.append(self._noise())
         elif self.noise_left_out:
-            found.append("no noise, as the scenario has none")
+            phrases.append("no noise, as the scenario has none")
         for given, what in ((self.initial_set, "a start"), (self.state_bounds, "states")):
             if given is not None:
                 each = [f"{name} {_range(value, plant.units.get(name, ''))}" for name, value in given.items()]
-                found.append(f"{what} with {_enough(each, 'each state within its bound')}")
+                phrases.append(f"{what} with {_enough(each, 'each state within its bound')}")
         if self.initial_error is not None:
             size = shown(float(f"{self.initial_error:.6g}"))
-            found.append(f"an observer's error at the start {f'within {size}' if self.initial_error else 'of zero'}")
-        return found
+            phrases.append(f"an observer's error at the start {f'within {size}' if self.initial_error else 'of zero'}")
+        return phrases
 
     def _noise(self) -> str:
         """Return the phrase on the noise: the largest value at each sensor, where each has its own."""

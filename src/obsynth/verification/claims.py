@@ -246,8 +246,8 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
         return
     rows = observer.fault_rows
     errors = ErrorModel(plant, observer, tracking)
-    found = certain_noise_covariance(errors.Az, errors.noise, -observer.Cz[rows], errors.output(rows)[3], plant.dt)
-    for name, variance in zip(observer.fault_names, np.diag(found), strict=True):
+    covariance = certain_noise_covariance(errors.Az, errors.noise, -observer.Cz[rows], errors.output(rows)[3], plant.dt)
+    for name, variance in zip(observer.fault_names, np.diag(covariance), strict=True):
         yield information(
             f"noise in the mean of fhat[{name}]",
             f"standard deviation under {noise_words(plant.noise_names)} of what is shipped, a mean of {mean}",

@@ -152,17 +152,17 @@ def _decided(given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: f
     value = None
     many = _order(given.model) > MOST_STATES_IN_BITS
     for bits in (0,) if many else (0, *STEADY_BITS):
-        found: Ball | None
+        miss: Ball | None
         if bits:
             with flint.ctx.workprec(bits):
                 exact = missed(given, ExtendedBall)
-                found = None if exact is None else as_ball(exact.content)
+                miss = None if exact is None else as_ball(exact.content)
         else:
-            found = missed(given, Ball)
-        if found is None or not np.all(np.isfinite(found.magnitude)):
+            miss = missed(given, Ball)
+        if miss is None or not np.all(np.isfinite(miss.magnitude)):
             continue
-        value = float(np.max(found.magnitude * sizes, initial=0.0))
-        if value <= limit or np.max((np.abs(found.midpoint) - found.radius) * sizes, initial=0.0) > limit:
+        value = float(np.max(miss.magnitude * sizes, initial=0.0))
+        if value <= limit or np.max((np.abs(miss.midpoint) - miss.radius) * sizes, initial=0.0) > limit:
             break
     return value
 
@@ -382,7 +382,7 @@ def _state_at(plant: DescriptorSystem, point: float) -> FloatArray | None:
     with flint.ctx.workprec(STEADY_BITS[1]):
         kind: type[Any] = ExtendedBall if plant.nx <= MOST_STATES_IN_BITS else Ball
         pencil = kind.exact(plant.E).scaled(point) - kind.exact(plant.A)
-        found = enclosed_solution(pencil, kind.exact(plant.Bf))
-        if found is None:
+        solution = enclosed_solution(pencil, kind.exact(plant.Bf))
+        if solution is None:
             return None
-        return (found if isinstance(found, Ball) else as_ball(found.content)).midpoint
+        return (solution if isinstance(solution, Ball) else as_ball(solution.content)).midpoint

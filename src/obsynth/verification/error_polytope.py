@@ -187,7 +187,7 @@ def _each(given: Any, name: str, count: int) -> tuple[FloatArray, ...]:
     several = several or (isinstance(given, np.ndarray) and given.ndim == 3)
     if not several:
         return (as_matrix(given, name),) * count
-    found = tuple(as_matrix(matrix, name) for matrix in given)
-    if len(found) != count:
-        raise SpecError(f"{name} is given at {len(found)} vertices, A at {count}.", path=name)
-    return found
+    matrices = tuple(as_matrix(matrix, name) for matrix in given)
+    if len(matrices) != count:
+        raise SpecError(f"{name} is given at {len(matrices)} vertices, A at {count}.", path=name)
+    return matrices

@@ -60,10 +60,10 @@ def prove_bounded_real(
     numbers = _digest(plant.Bd, plant.Dd, tracking, factor, np.array([gain]))
     if numbers in known:
         return known[numbers]
-    found = _try_bounded_real(plant, observer, tracking, factor, gain)
-    if found.proved:
-        known[numbers] = found
-    return found
+    proof = _try_bounded_real(plant, observer, tracking, factor, gain)
+    if proof.proved:
+        known[numbers] = proof
+    return proof
 
 
 @remembered
@@ -73,11 +73,11 @@ def _proofs_of(_observer: LinearObserver) -> dict[bytes, DefinitenessProof]:
 
 def _digest(*parts: FloatArray) -> bytes:
     """Return what tells numbers ``(m, n)`` from all others."""
-    found = blake2b()
+    digest = blake2b()
     for part in parts:
-        found.update(repr((part.shape, part.dtype.str)).encode())
-        found.update(np.ascontiguousarray(part).data)
-    return found.digest()
+        digest.update(repr((part.shape, part.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(part).data)
+    return digest.digest()
 
 
 def _try_bounded_real(
@@ -251,8 +251,8 @@ def _distance_from_axis(system: System, gain: float, *, discrete: bool) -> float
     order, tables = a.nrows(), (closed.tolist(), entering.tolist(), shown.tolist(), closed.transpose().tolist())
     rows = [[*tables[0][i], *tables[1][i]] for i in range(order)]
     rows += [[*(-x for x in tables[2][i]), *(-x for x in tables[3][i])] for i in range(order)]
-    found = flint.acb_mat(flint.arb_mat(rows)).eig(multiple=True)
-    return max(min(float(abs(value.real).abs_lower()) for value in found), 0.0)
+    eigenvalues = flint.acb_mat(flint.arb_mat(rows)).eig(multiple=True)
+    return max(min(float(abs(value.real).abs_lower()) for value in eigenvalues), 0.0)
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
@@ -281,8 +281,8 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
 
 def stability_factor(observer: LinearObserver) -> FloatArray:
     """Return Q, upper triangular, with which `prove_stable` succeeds: of a proved contraction, the identity without."""
-    found = contraction_of(observer)
-    return np.eye(observer.order) if found is None else found.Q
+    contraction = contraction_of(observer)
+    return np.eye(observer.order) if contraction is None else contraction.Q
 
 
 def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:

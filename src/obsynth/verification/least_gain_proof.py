@@ -169,18 +169,18 @@ def least_gain_row(
             detail=detail,
         )
     pairs = None if work is None else InvisiblePairs.of(work, gains)
-    found = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
-    holds = found * (1.0 - BOUND_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= found
+    bound = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
+    holds = bound * (1.0 - BOUND_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= bound
     return Check(
         "least gain",
         f"no filter with {family} has a smaller gain than the claimed one, to {PROVED_SHARE:.0e} of it",
-        found,
+        bound,
         claimed,
-        min(claimed * (1.0 + BOUND_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
+        min(claimed * (1.0 + BOUND_TOLERANCE) - bound, bound - claimed * (1.0 - PROVED_SHARE)),
         bool(holds),
         "disturbances that no gain can attenuate, exactly; sums in ball arithmetic",
         "proved",
-        f"proved: at least {found:.9g}",
+        f"proved: at least {bound:.9g}",
     )
 
 

@@ -81,9 +81,9 @@ def tracking_rows(
     models: Sequence[ErrorModel], scheduling: Scheduling, words: Mapping[str, tuple[str, str, str]]
 ) -> Iterator[Check]:
     """Yield the rows that the observer is unbiased at every vertex, each for the vertex where it misses most."""
-    found = [tracking_identities(model) for model in models]
+    each_vertex = [tracking_identities(model) for model in models]
     for key, (name, claim, source) in words.items():
-        residuals = [identities[key].residual(None) for identities in found]
+        residuals = [identities[key].residual(None) for identities in each_vertex]
         place = residuals.index(worst(residuals))
         row = equality(name, f"{claim}, at every vertex", residuals[place], source)
         yield replace(row, detail=f"{row.detail}, at {scheduling.vertex_name(place)}")
@@ -91,14 +91,14 @@ def tracking_rows(
 
 def worst_of_vertices(reports: Iterable[Iterable[Check]], scheduling: Scheduling) -> Iterator[Check]:
     """Yield each row of reports at the vertices once, that of the vertex where its margin is least beside its bound."""
-    found: dict[str, tuple[float, int, Check]] = {}
+    worst: dict[str, tuple[float, int, Check]] = {}
     for place, report in enumerate(reports):
         for row in report:
             share = row.margin / abs(row.bound) if row.bound else row.margin
             rank = -np.inf if not row.passed or np.isnan(share) else share
-            if row.name not in found or rank < found[row.name][0]:
-                found[row.name] = (rank, place, row)
-    for _, place, row in found.values():
+            if row.name not in worst or rank < worst[row.name][0]:
+                worst[row.name] = (rank, place, row)
+    for _, place, row in worst.values():
         yield replace(
             row, claim=f"{row.claim}, at every vertex", detail=f"{row.detail}, at {scheduling.vertex_name(place)}"
         )
@@ -183,13 +183,13 @@ def gain_row(
 
 def switching_row(vertices: Sequence[Vertex], level: float) -> Check:
     """Return the row on the worst course of the weights that was found, beside what is proved: it informs."""
-    found = worst_switching([tuple(part.midpoint for part in vertex(Ball)) for vertex in vertices])
+    gain = worst_switching([tuple(part.midpoint for part in vertex(Ball)) for vertex in vertices])
     return information(
         SWITCHING_ROW,
         "a gain that some course of the parameters reaches: no claim below it can be true",
-        found,
+        gain,
         source="coordinate ascent over courses between vertices",
-        detail=f"{found / level:.3f} of what is proved" if level > 0.0 else "",
+        detail=f"{gain / level:.3f} of what is proved" if level > 0.0 else "",
     )
 
 

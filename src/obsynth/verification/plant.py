@@ -132,31 +132,31 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
             )
         return
     try:
-        found = source.derived
+        derived = source.derived
     except ObsynthError as error:
         yield upper_bound_check(
             "plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE, detail=str(error)
         )
         return
-    missed = _numbers_missed(source, found.plant.exact, plant.exact)
-    told = found.description or "nothing had to be done"
+    missed = _numbers_missed(source, derived.plant.exact, plant.exact)
+    description = derived.description or "nothing had to be done"
     follows = upper_bound_check(
         "plant as written",
         "the plant of the design follows from it",
-        float(np.max([missed, _difference(found.plant, plant, PLANT_MATRICES)])),
+        float(np.max([missed, _difference(derived.plant, plant, PLANT_MATRICES)])),
         DERIVED_TOLERANCE,
         source=_SOURCE,
         kind="equality",
-        detail="the exact numbers are others" if missed > DERIVED_TOLERANCE else told,
+        detail="the exact numbers are others" if missed > DERIVED_TOLERANCE else description,
     )
     yield follows
     if not follows.passed:
         return
-    if design.recovery is not None and design.recovery.names == found.recovery.names:
+    if design.recovery is not None and design.recovery.names == derived.recovery.names:
         yield upper_bound_check(
             "recovery as written",
             "the states as written follow from those of the design as its recovery says",
-            _difference(found.recovery, design.recovery, _STORED_MAPS),
+            _difference(derived.recovery, design.recovery, _STORED_MAPS),
             DERIVED_TOLERANCE,
             source=_SOURCE,
             kind="equality",

@@ -116,7 +116,7 @@ def _growth(errors: ErrorPolytope, dt: float) -> float:
     point of the hull has a larger one."""
 
     def logarithmic_norm(matrix: FloatArray) -> float:
-        found = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[-1])
-        return found + (_ROOM - 1.0) * float(np.linalg.norm(matrix))
+        largest = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[-1])
+        return largest + (_ROOM - 1.0) * float(np.linalg.norm(matrix))
 
     return math.exp(max(0.0, *map(logarithmic_norm, errors.A)) * dt)

@@ -24,12 +24,12 @@ _SOURCE = "over the region: Nikoukhah, Willsky, Levy 1992 with constant L, K"
 
 def kalman_conditions_over_region(plant: PolytopicSystem) -> tuple[Condition, ...]:
     """Return the existence conditions over a region; the list ends at the first failure."""
-    found = []
+    conditions = []
     for condition in _in_order(plant):
-        found.append(condition)
+        conditions.append(condition)
         if not condition.holds:
             break
-    return tuple(found)
+    return tuple(conditions)
 
 
 def free_equations(plant: PolytopicSystem) -> FloatArray:

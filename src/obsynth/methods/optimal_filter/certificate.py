@@ -185,11 +185,11 @@ def _candidates(plant: DescriptorSystem, chosen: Designed) -> list[list[complex]
     if free <= 0:
         return [_zeros_outside(plant), []] if plant.is_discrete else [_zeros_outside(plant)]
     edge = [_edge_point(plant, chosen)] if chosen.limit > chosen.nothing else []
-    found: list[list[complex]] = []
+    candidates: list[list[complex]] = []
     for decays in reversed(chosen.decays):
         points = [point for value in decays if (point := _point_of(plant, chosen, complex(value))) is not None]
-        found.append(points + edge if not found else points)
-    return [*found, edge] if edge else [*found, []] if plant.is_discrete else found
+        candidates.append(points + edge if not candidates else points)
+    return [*candidates, edge] if edge else [*candidates, []] if plant.is_discrete else candidates
 
 
 def _point_of(plant: DescriptorSystem, chosen: Designed, decay: complex) -> complex | None:
@@ -212,7 +212,7 @@ def _zeros_outside(plant: DescriptorSystem) -> list[complex]:
     moved = np.zeros_like(still)
     moved[: plant.nx, : plant.nx] = plant.E
     alpha, beta = scipy.linalg.eigvals(still, -moved, homogeneous_eigvals=True)
-    found: list[complex] = []
+    unstable: list[complex] = []
     for top, bottom in zip(alpha, beta, strict=True):
         if abs(bottom) * INFINITE_EIGENVALUE <= abs(top):
             continue
@@ -220,5 +220,5 @@ def _zeros_outside(plant: DescriptorSystem) -> list[complex]:
         value = complex(value.real) if abs(value.imag) <= REAL_SHARE * abs(value) else value
         outside = abs(value) > 1.0 if plant.is_discrete else value.real > 0.0
         if outside and value.imag >= 0.0:
-            found.append(value)
-    return found
+            unstable.append(value)
+    return unstable

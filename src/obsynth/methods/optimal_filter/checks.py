@@ -246,10 +246,10 @@ def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int
     units = PlantUnits.of(plant).faults
     worst, largest = np.zeros(len(c)), np.zeros(len(c))
     for point in points:
-        found = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
+        response = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
         wanted = np.diag(point**-late) if reference is None else _response(reference, point)
         # What is no number stays none, and fails.
-        worst = np.maximum(worst, np.max(np.abs(found - wanted) * units, axis=1, initial=0.0))
+        worst = np.maximum(worst, np.max(np.abs(response - wanted) * units, axis=1, initial=0.0))
         largest = np.maximum(largest, np.max(np.abs(wanted) * units, axis=1, initial=0.0))
     sizes = np.where(largest > 0.0, largest, np.max(largest, initial=0.0) or 1.0)
     return float(np.max(worst / sizes, initial=0.0)), count
@@ -321,13 +321,13 @@ def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) ->
         covariance = continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
         # White noise that passes, by more than rounding, has no mean square.
         d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
-    found = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
+    deviation = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
     # Of zero nothing but rounding may be left.
     unit = stated if stated else channel.size * ZERO_GAIN / DEVIATION_SHARE
     return upper_bound_check(
         "deviation",
         "root mean square of the error for white noise, recomputed: relative difference",
-        abs(found - stated) / max(unit, float(np.finfo(float).tiny)),
+        abs(deviation - stated) / max(unit, float(np.finfo(float).tiny)),
         DEVIATION_SHARE,
         source="Lyapunov equation",
         kind="computed",
@@ -338,13 +338,13 @@ def _least_deviation(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     """Compute the least mean square from the plant again: the filtering Riccati equation is the proof."""
     stated = claimed(design.certificate.claims, "least_deviation")
     try:
-        found = designed(plant, _claimed_map(design), "h2").gain
+        least = designed(plant, _claimed_map(design), "h2").gain
     except PreconditionError:
-        found = np.nan
+        least = np.nan
     return lower_bound_check(
         "least deviation",
         "every causal linear filter with this fault map has at least this root mean square",
-        found * (1.0 + DEVIATION_SHARE),
+        least * (1.0 + DEVIATION_SHARE),
         stated,
         source="filtering Riccati equation of the plant, solved again",
     )

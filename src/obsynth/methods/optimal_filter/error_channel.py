@@ -71,8 +71,8 @@ class ErrorChannel:
         parts = [_identity(count) if model is None else model for model, count in zip(inputs, counts, strict=True)]
         before = tuple(np.asarray(block_diag(*(part[i] for part in parts)), dtype=np.float64) for i in range(4))
         behind = _identity(len(self.model.observer.Cz)) if weights.errors is None else weights.errors
-        found = _in_series(kind, tuple(kind.exact(part) for part in before), system)
-        return _in_series(kind, found, tuple(kind.exact(part) for part in behind))
+        weighted = _in_series(kind, tuple(kind.exact(part) for part in before), system)
+        return _in_series(kind, weighted, tuple(kind.exact(part) for part in behind))
 
     def _unweighted(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         model, exact = self.model, kind.exact

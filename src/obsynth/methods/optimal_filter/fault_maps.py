@@ -230,9 +230,9 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     )
     models = fault_map.setting.models
     if not models:
-        found = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
+        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
         weights = (own.faults / units.error)[:, None]
-        return replace(found, L=weights * found.L, D1=weights * found.D1, F=weights * found.F)
+        return replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
     a, b, c, d = reduce(in_series, models)
     scaled = (a, b * each, c / units.error, d * each / units.error)
     return estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
@@ -265,19 +265,19 @@ def designed(
     try:
         if norm == "h2" and not plant.is_discrete:
             continuous = least_mean_square(problem)
-            found = None
+            estimation = None
             filter_ = continuous.A, continuous.B, continuous.C, continuous.D
             gain = continuous.deviation
         else:
-            found = least_estimation(problem, norm=norm, noises=noises)
-            filter_, gain = realised(problem, found.K, found.Z0, plant.ny), found.gain
+            estimation = least_estimation(problem, norm=norm, noises=noises)
+            filter_, gain = realised(problem, estimation.K, estimation.Z0, plant.ny), estimation.gain
             filter_ = filter_ if plant.is_discrete else uncayley(*filter_, problem.alpha)
     except np.linalg.LinAlgError as error:
         raise PreconditionError(
             f"The equations of the least gain have no solution: {error}.", condition="zeros"
         ) from error
     nothing = filter_[0]
-    least = found or LeastEstimation(nothing, nothing, gain, 0.0, 0.0, 0.0, ())
+    least = estimation or LeastEstimation(nothing, nothing, gain, 0.0, 0.0, 0.0, ())
     return Designed(
         fault_map,
         problem,

@@ -148,14 +148,14 @@ def _error_model(design: ObserverDesign) -> ErrorModel | None:
         return None
     if set(design.observer.fault_names) != set(design.plant.fault_names) or not design.plant.nf:
         return None
-    found = method_class(design.method).error_model(design)
+    model = method_class(design.method).error_model(design)
     if (
-        found is None
-        or max(found.plant.nx, found.observer.order) > MOST_STATES
-        or found.observer.fault_names != found.plant.fault_names
+        model is None
+        or max(model.plant.nx, model.observer.order) > MOST_STATES
+        or model.observer.fault_names != model.plant.fault_names
     ):
         return None
-    return found
+    return model
 
 
 def _effect_of_disturbances(model: ErrorModel) -> float:
@@ -176,10 +176,10 @@ def _map_of(delay: tuple[int, ...], *, more: int = 0) -> FaultMap:
 def _least(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> float:
     """Return the least norm; NaN where none is found."""
     try:
-        found = designed(plant, fault_map, norm)
+        least = designed(plant, fault_map, norm)
     except (ObsynthError, np.linalg.LinAlgError):
         return float("nan")
-    return 0.0 if found.is_nothing else found.gain
+    return 0.0 if least.is_nothing else least.gain
 
 
 def _driven_by_disturbances(plant: DescriptorSystem) -> DescriptorSystem:
@@ -212,8 +212,8 @@ def _delay_of(response: Model, observer: LinearObserver, plant: DescriptorSystem
     a, b, c, d = response
     count = 2 * len(a) + max(delays, default=0) + MORE_POINTS
     for point in np.exp(1j * (np.arange(count) + 0.5) * np.pi / count):
-        found = c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d
-        if np.max(np.abs(found - np.diag([point**-delay for delay in delays]))) > SAME_RESPONSE:
+        transfer = c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d
+        if np.max(np.abs(transfer - np.diag([point**-delay for delay in delays]))) > SAME_RESPONSE:
             return None
     return delays
 

@@ -142,8 +142,8 @@ class OptimalFilterMethod(Method):
 
     def as_plain(self) -> dict[str, Any]:
         """Return every option by name, as lists, mappings, numbers and texts."""
-        found = super().as_plain()
-        return found | {"reference": _as_matrices(self.reference), "weights": _as_matrices(self.weights)}
+        options = super().as_plain()
+        return options | {"reference": _as_matrices(self.reference), "weights": _as_matrices(self.weights)}
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return whether any causal filter has the fault map that is asked for, in floating point."""

@@ -121,8 +121,8 @@ class OptimalFilter(ObserverDesign):
         Axes
             The delay of this filter is marked.
         """
-        found: Axes = registered("plot_delays")(self, axes=axes)
-        return found
+        drawn: Axes = registered("plot_delays")(self, axes=axes)
+        return drawn
 
 
 # Its parameters are those of every design.

@@ -80,12 +80,12 @@ def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list
     """
     a, b, c, d = filter_
     filter_ = _without_rounding((a, b / outputs, c, d / outputs))
-    found = [minimal(filter_, discrete=discrete)]
+    minimal_ones = [minimal(filter_, discrete=discrete)]
     if discrete:
         a, b, c, d = filter_
         kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
-        found.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
-    return [(a, b * outputs, c, d * outputs) for a, b, c, d in found]
+        minimal_ones.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
+    return [(a, b * outputs, c, d * outputs) for a, b, c, d in minimal_ones]
 
 
 def _without_rounding(filter_: Model) -> Model:
@@ -112,13 +112,13 @@ def _balanced(filter_: Model) -> Model:
 
 def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which states are linked to the first ones, ``link[i, j]``: from j to i."""
-    found = first
+    linked = first
     for _ in range(len(link)):
-        more = found | (link @ found)
-        if np.array_equal(more, found):
+        more = linked | (link @ linked)
+        if np.array_equal(more, linked):
             break
-        found = more
-    return found
+        linked = more
+    return linked
 
 
 def _cleaned(matrix: FloatArray) -> FloatArray:
@@ -139,10 +139,10 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
         if lag == 0 and rows is copies[0] and not len(rows):
             continue
         for filter_ in filters:
-            found, share = _followed(plant, filter_, rows, moved, lag)
-            if found is not None and share == IDENTITIES_LEFT[0]:
-                return found
-            less_exact = less_exact or found
+            follower, share = _followed(plant, filter_, rows, moved, lag)
+            if follower is not None and share == IDENTITIES_LEFT[0]:
+                return follower
+            less_exact = less_exact or follower
     if less_exact is not None:
         return less_exact
     raise SolverError(
@@ -248,7 +248,7 @@ def _followed(
     basis = reachable_basis(moved.T, np.vstack([into, shown]).T) if count else np.zeros((0, 0))
     into, shown, moved = into @ basis, shown @ basis, basis.T @ moved @ basis
     copies, kept = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
-    found = Followed(
+    follower = Followed(
         np.block([[a, into], [np.zeros((kept, nz)), moved]]),
         np.vstack([b, np.zeros((kept, plant.ny))]),
         np.hstack([c, shown]),
@@ -257,7 +257,7 @@ def _followed(
         s @ left,
         lag,
     )
-    return found, share
+    return follower, share
 
 
 def _cleaned_solution(
@@ -286,11 +286,11 @@ def _solved(system: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatAr
     largest = np.max(np.abs(scaled), axis=0, initial=0.0)
     units = 1.0 / np.where(largest > 0.0, largest, 1.0)
     scaled *= units
-    found = np.zeros(system.shape[1])
+    solution = np.zeros(system.shape[1])
     for _ in range(SOLUTIONS):
-        missed = scale * (wanted - system @ found)
-        found = found + units * scipy.linalg.lstsq(scaled, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
-    return found, units
+        missed = scale * (wanted - system @ solution)
+        solution = solution + units * scipy.linalg.lstsq(scaled, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
+    return solution, units
 
 
 def _holds(

@@ -79,13 +79,13 @@ def _shaped(parts: Sequence[Any], what: str, path: str) -> Model:
     rows, inputs = d.shape
     n = len(np.atleast_2d(parts[0])) if np.size(parts[0]) else 0
     wanted = ((n, n), (n, inputs), (rows, n))
-    found: list[FloatArray] = []
+    matrices: list[FloatArray] = []
     for name, part, shape in zip("ABC", parts, wanted, strict=False):
         matrix = as_matrix(part, f"{path.rpartition('.')[2]}.{name}") if n else np.zeros(shape)
         if matrix.shape != shape:
             raise SpecError(f"{name} of the {what} has shape {matrix.shape}: {shape} fits A and D.", path=path)
-        found.append(matrix)
-    return found[0], found[1], found[2], d
+        matrices.append(matrix)
+    return matrices[0], matrices[1], matrices[2], d
 
 
 def _of_control(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:

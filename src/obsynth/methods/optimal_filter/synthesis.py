@@ -137,11 +137,11 @@ def _made(
     ``searched``: the plant that the filter was searched for, where noise was added.
     """
     fault_map = chosen.fault_map
-    chosen, found, observer = _with_enough_noise(plant if searched is None else searched, chosen, asked.norm)
+    chosen, follower, observer = _with_enough_noise(plant if searched is None else searched, chosen, asked.norm)
     if searched is not None:
-        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, observer, found))
-    matrices, claims = certified(plant, chosen, observer, found, asked.norm)
-    matrices |= {"T": found.T, "T0": found.T0, "stability": stability_factor(observer)}
+        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, observer, follower))
+    matrices, claims = certified(plant, chosen, observer, follower, asked.norm)
+    matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
     if reference is not None:
         matrices |= {f"reference_{name}": part for name, part in zip("ABCD", reference, strict=True)}
@@ -159,7 +159,7 @@ def _made(
         "added_noise": chosen.added_noise,
         "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
-    gains = {"T": found.T, "T0": found.T0}
+    gains = {"T": follower.T, "T0": follower.T0}
     notes = tuple(_notes(plant, curve, chosen, asked, claims))
     notes += () if searched is None else (LASTING_NOTE,)
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
@@ -189,14 +189,14 @@ def _with_enough_noise(
         try:
             outputs = PlantUnits.of(plant).rounded().outputs
             ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
-            found = followed(plant, ways, problem.window + problem.shift)
-            rows = len(found.C)
+            follower = followed(plant, ways, problem.window + problem.shift)
+            rows = len(follower.C)
             names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-            observer = observer_of(plant, found, names, fault_map.delays or (0,) * rows)
-            model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
+            observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
+            model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
             exact = fault_map.exact and bool(more)
             if not exact or fault_map_missed(model, fault_map)[0] <= EXACT_SHARE:
-                return chosen, found, observer
+                return chosen, follower, observer
         except SolverError:
             if not more:
                 raise
@@ -366,8 +366,8 @@ def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[
         )
         try:
             least = designed(noisy, chosen.fault_map, "hinf", ADDED_NOISES[:1])
-            least, found, observer = _with_enough_noise(noisy, least, "hinf")
-            _, claims = certified(noisy, least, observer, found, "hinf")
+            least, follower, observer = _with_enough_noise(noisy, least, "hinf")
+            _, claims = certified(noisy, least, observer, follower, "hinf")
         except (PreconditionError, SolverError):
             continue
         if not least.added_noise and claims["gain"] - claims.get("least", 0.0) <= CLOSED_GAP * claims["gain"]:

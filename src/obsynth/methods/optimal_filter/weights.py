@@ -59,12 +59,12 @@ def weights_of(given: Any, plant: DescriptorSystem, *, rows: int, exact: bool) -
         _require_inverse(model, plant, f"{ERRORS}.{name}")
     faults = () if exact else plant.fault_names
     inputs = _by_name(given.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
-    found = Weights(
+    weights = Weights(
         _diagonal(errors, names),
         _diagonal(inputs, plant.noise_names),
         _diagonal(inputs, faults),
     )
-    return None if found == (None, None, None) else found
+    return None if weights == (None, None, None) else weights
 
 
 def plain_weights(given: Any, plant: DescriptorSystem) -> Any:
@@ -72,13 +72,13 @@ def plain_weights(given: Any, plant: DescriptorSystem) -> Any:
     if given is None:
         return None
     groups = {ERRORS: given.get(ERRORS), INPUTS: given.get(INPUTS)}
-    found: dict[str, Any] = {}
+    weights_by_group: dict[str, Any] = {}
     for group, entry in groups.items():
         if isinstance(entry, Mapping) and not _is_model(entry):
-            found[group] = {str(name): _plain(one, plant, f"{group}.{name}") for name, one in entry.items()}
+            weights_by_group[group] = {str(name): _plain(one, plant, f"{group}.{name}") for name, one in entry.items()}
         elif entry is not None:
-            found[group] = _plain(entry, plant, group)
-    return found
+            weights_by_group[group] = _plain(entry, plant, group)
+    return weights_by_group
 
 
 def inverse(model: Model) -> Model:

@@ -171,15 +171,15 @@ def _completed_names(system: Any, names: list[str], differential: int) -> list[s
             start = 0 if getattr(variable, "v_code", "x") == "x" else differential
             for device, address in zip(idx, np.ravel(getattr(variable, "a", ())), strict=False):
                 of_devices.setdefault(start + int(address), f"{variable.name} {type(model).__name__} {device}")
-    found: list[str] = []
+    completed: list[str] = []
     for place, name in enumerate(names):
         text = name.strip()
         if not text or counts[text] > 1:
             text = of_devices.get(place, text or "variable")
-        if text in found or (text != name.strip() and counts[text]):
+        if text in completed or (text != name.strip() and counts[text]):
             text = f"{text} {place + 1}"
-        found.append(text)
-    return found
+        completed.append(text)
+    return completed
 
 
 def _dense(matrix: Any) -> FloatArray:

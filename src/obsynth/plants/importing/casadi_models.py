@@ -92,13 +92,13 @@ def from_casadi(
         return dict(function(**{name: casadi.vertcat(*given[name]) for name in function.name_in()}))
 
     def equations(rates: Any, x: Any, u: Any, theta: Any) -> list[Any]:
-        found = values(x, u, theta)
-        moving = [rates[i] - found["ode"][i] for i in range(nx)]
-        return moving + [found["alg"][i] for i in range(nz)]
+        parts = values(x, u, theta)
+        moving = [rates[i] - parts["ode"][i] for i in range(nx)]
+        return moving + [parts["alg"][i] for i in range(nz)]
 
     def outputs(x: Any, theta: Any) -> list[Any]:
-        found = values(x, [0.0] * taken["u"], theta)["y"]
-        return [found[i] for i in range(made["y"])]
+        y = values(x, [0.0] * taken["u"], theta)["y"]
+        return [y[i] for i in range(made["y"])]
 
     output_names = [f"y{i + 1}" for i in range(made["y"])] if output_names is None else output_names
     return DAEModel(

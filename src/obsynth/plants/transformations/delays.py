@@ -187,8 +187,8 @@ def linear_plant(given: Any) -> DescriptorSystem:
         )
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
     made = without_delays(plant)
-    found: DescriptorSystem = made.plant if isinstance(made, Transformation) else made
-    return found
+    linear: DescriptorSystem = made.plant if isinstance(made, Transformation) else made
+    return linear
 
 
 def _approximated(plant: DescriptorSystem, order: int) -> Transformation:

@@ -98,7 +98,7 @@ def entries_in(
     value, e, by_state, by_input, by_parameter, y, c, seen = local
     known, unknown, faults = ([int(i) for i in columns[name]] for name in ("B", "Bd", "Bf"))
     b = -by_input[:, known]
-    found = {
+    matrices = {
         "E": e,
         "A": -by_state,
         "B": ca.horzcat(b, e @ ca.DM(point.rates)) if moving else b,
@@ -108,7 +108,7 @@ def entries_in(
         "Bd": -by_input[:, unknown],
     }
     writer = _Writer(symbols)
-    entries = {name: texts for name, matrix in found.items() if (texts := writer.entries(matrix, name))}
+    entries = {name: texts for name, matrix in matrices.items() if (texts := writer.entries(matrix, name))}
     return entries, writer.changes(value, -1.0, nominal), writer.changes(y, 1.0, nominal)
 
 
@@ -190,12 +190,12 @@ class _Writer:
 
     def changes(self, column: Any, sign: float, nominal: Mapping[str, float]) -> list[Entry]:
         """Return texts of ``sign`` times how a column changes from its nominal value."""
-        found = []
+        changes = []
         for i, _, text in self.entries(column, "the equilibrium's shift"):
             middle = float(parse_expression(text)(nominal))
             rest = f"{text} - {_number(middle)[0]}" if middle else text
-            found.append((i, 0, rest if sign > 0.0 else f"-({rest})"))
-        return found
+            changes.append((i, 0, rest if sign > 0.0 else f"-({rest})"))
+        return changes
 
     def whole(self, node: Any, place: str) -> str:
         """Return the text of one entry; `PreconditionError` where the language has none for it."""

@@ -51,11 +51,11 @@ def _augmented(uncertain: Uncertainty, nx: int, chosen: Sequence[int]) -> Uncert
     """Return what is uncertain in a plant whose ``chosen`` faults have become states: entries of Df are then of C."""
     if uncertain.written is not None:
         return uncertain.left_behind("faults were appended as states after the plant was transformed")
-    entries = {name: list(found) for name, found in uncertain.entries.items()}
+    entries = {name: list(items) for name, items in uncertain.entries.items()}
     direct = entries.pop("Df", [])
     moved = [(row, nx + chosen.index(column), text) for row, column, text in direct if column in chosen]
     kept = {"C": [*entries.get("C", []), *moved], "Df": [item for item in direct if item[1] not in chosen]}
-    return replace(uncertain, entries={name: tuple(found) for name, found in {**entries, **kept}.items() if found})
+    return replace(uncertain, entries={name: tuple(items) for name, items in {**entries, **kept}.items() if items})
 
 
 def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Sequence[str]) -> None:

@@ -158,8 +158,8 @@ def _split(plant: DescriptorSystem) -> _Split | None:
     if plant.nx > EXACT_ELIMINATION_UP_TO:
         return None
     count = plant.nx - sum(structure_of(plant).infinite_block_sizes)
-    found = _split_exactly(plant, count) if plant.exact is None else None
-    return found or _split_in_floating_point(plant, count)
+    exact_split = _split_exactly(plant, count) if plant.exact is None else None
+    return exact_split or _split_in_floating_point(plant, count)
 
 
 def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
@@ -310,16 +310,16 @@ def _transformation(plant: DescriptorSystem, split: _Split) -> Transformation:
     def parts(matrix: FloatArray) -> list[FloatArray]:
         return [matrix[:, first:last] for first, last in pairwise(ends)]
 
-    found = {"A": split.A, "C": split.C}
-    found |= dict(zip(("B", "Bf", "Bd", "Bw"), parts(split.B), strict=True))
-    found |= dict(zip(("D", "Df", "Dd", "Dw"), parts(split.D), strict=True))
+    matrices = {"A": split.A, "C": split.C}
+    matrices |= dict(zip(("B", "Bf", "Bd", "Bw"), parts(split.B), strict=True))
+    matrices |= dict(zip(("D", "Df", "Dd", "Dw"), parts(split.D), strict=True))
     whole = not split.X[list(split.chosen)].any()
     names = [plant.state_names[i] for i in split.chosen] if whole else [f"xi {i + 1}" for i in range(count)]
     new = with_states(
         plant,
         names,
         E=None,
-        **found,
+        **matrices,
         exact=_exact_numbers(plant, split, ends),
         uncertainty=None if plant.uncertainty is None else plant.uncertainty.left_behind("its index was reduced"),
     )

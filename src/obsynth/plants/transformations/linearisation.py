@@ -201,9 +201,9 @@ def linearise(
         point = consistent_point(model, nominal_point(model, values), values)
     if asked:
         faults = unscheduled_faults(model, asked, faults, disturbances)
-    found = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box, scheduled=asked)
-    found = _with_noise(found, model.equation_names, process_noise, sensor_noise)
-    return over_scheduling(found, model, point, asked, faults or (), disturbances) if asked else found
+    linear = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box, scheduled=asked)
+    linear = _with_noise(linear, model.equation_names, process_noise, sensor_noise)
+    return over_scheduling(linear, model, point, asked, faults or (), disturbances) if asked else linear
 
 
 def _with_noise(
@@ -328,11 +328,11 @@ def _over_box(
     if moved or shown:
         shift = shift_name(linear)
         nu = linear.nu
-        for name, found in (("B", moved), ("D", shown)):
-            if found:
-                entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in found)]
+        for name, items in (("B", moved), ("D", shown)):
+            if items:
+                entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in items)]
         linear = with_shift(linear, shift)
-    uncertainty = Uncertainty(box, {name: tuple(found) for name, found in entries.items()}, shift=shift)
+    uncertainty = Uncertainty(box, {name: tuple(items) for name, items in entries.items()}, shift=shift)
     kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
     return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
 

@@ -108,12 +108,12 @@ def over_scheduling(
     if moved or shown:
         shift, place = shift_name(linear), linear.nu
         linear = with_shift(linear, shift)
-        for name, found in (("B", moved), ("D", shown)):
-            entries[name] = [*entries.get(name, []), *((i, place, text) for i, _, text in found)]
+        for name, items in (("B", moved), ("D", shown)):
+            entries[name] = [*entries.get(name, []), *((i, place, text) for i, _, text in items)]
     arguments = {name: value for name, value in linear.as_dict().items() if value is not None}
-    for name, found in entries.items():
+    for name, items in entries.items():
         rows: list[list[Any]] = np.asarray(getattr(linear, name)).tolist()
-        for i, j, text in found:
+        for i, j, text in items:
             rows[i][j] = text
         arguments[name] = rows
     scheduling = {

@@ -100,11 +100,11 @@ def moving_columns(plant: DescriptorSystem, behind: DescriptorSystem | None = No
         return None
     judged = JUDGED_PIECES if plant.nx * smooth.nd <= MOST_ENTRIES else JUDGED_PIECES_OF_MANY
     a, bd = AffineMatrix.exact(smooth.A, 0), AffineMatrix.exact(smooth.Bd, 0)
-    found = interval_columns(a, bd, plant.dt, pieces=judged)
-    radius = np.sum([block.radius for block in found.blocks], axis=0)
-    inverse = affine_inverse(AffineMatrix.exact(found.directions, 0)).magnitude
-    sizes = rounded_up(found.rest + inverse @ radius, plant.nx + len(found.blocks))
-    sizes = np.where((found.rest > 0.0) | (radius > 0.0), sizes, 0.0)
+    interval = interval_columns(a, bd, plant.dt, pieces=judged)
+    radius = np.sum([block.radius for block in interval.blocks], axis=0)
+    inverse = affine_inverse(AffineMatrix.exact(interval.directions, 0)).magnitude
+    sizes = rounded_up(interval.rest + inverse @ radius, plant.nx + len(interval.blocks))
+    sizes = np.where((interval.rest > 0.0) | (radius > 0.0), sizes, 0.0)
     pieces = next((pieces for most, pieces in RESTING_PIECES if smooth.nd <= most), FEWEST_PIECES)
     resting, shares = _resting(smooth, plant.dt, pieces)
 
@@ -113,9 +113,9 @@ def moving_columns(plant: DescriptorSystem, behind: DescriptorSystem | None = No
         blocks = columns.reshape(plant.nx, -1, smooth.nd)
         return np.pad(blocks, ((0, 0), (0, 0), (0, plant.nd - smooth.nd))).reshape(plant.nx, -1)
 
-    columns = np.hstack([block.center for block in found.blocks])
+    columns = np.hstack([block.center for block in interval.blocks])
     moved = np.arange(plant.nd) < smooth.nd
-    return MovingColumns(of_all(resting), shares, of_all(columns), found.directions, of_all(sizes), moved)
+    return MovingColumns(of_all(resting), shares, of_all(columns), interval.directions, of_all(sizes), moved)
 
 
 def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> tuple[FloatArray, FloatArray]:

@@ -116,13 +116,13 @@ def _intensities_by_equation(model: DAEModel, given: Mapping[str, float] | None)
 
 def _offsets(given: Any, names: Sequence[str], noises: Mapping[str, SensorNoise]) -> dict[str, tuple[float, float]]:
     """Return by output the deviation of its offset, and how far it walks: in the unit of a deviation."""
-    found = {}
+    offsets = {}
     for name, value in (given if isinstance(given, Mapping) else dict.fromkeys(given, "unknown")).items():
         index_of(name, names, what="offset")
         size = noises[name].size if name in noises else 1.0
         deviation = OFFSET_SIZE * size if value == "unknown" else stated_number(value, f"offset.{name}")
-        found[name] = deviation, OFFSET_WALK * size
-    return found
+        offsets[name] = deviation, OFFSET_WALK * size
+    return offsets
 
 
 def _of_matrices(
@@ -190,10 +190,10 @@ def _columns_of(
     known = {"Bd": ("Dd", plant.disturbance_names), "Bf": ("Df", plant.fault_names)}
     moved = []
     for name in loads:
-        found = [(matrix, direct, names.index(name)) for matrix, (direct, names) in known.items() if name in names]
-        if not found:
+        homes = [(matrix, direct, names.index(name)) for matrix, (direct, names) in known.items() if name in names]
+        if not homes:
             index_of(name, (*plant.disturbance_names, *plant.fault_names), what="walks")
-        moved.append(found[0])
+        moved.append(homes[0])
     left = {
         matrix: [i for i in range(len(names)) if not any(item[0] == matrix and item[2] == i for item in moved)]
         for matrix, (_, names) in known.items()
@@ -213,7 +213,7 @@ def _carried(
         return uncertain
     if uncertain.written is not None:
         return uncertain.left_behind("states were appended after the plant was transformed: append them before")
-    entries = {name: list(found) for name, found in uncertain.entries.items()}
+    entries = {name: list(items) for name, items in uncertain.entries.items()}
     for matrix, target in (("Bd", "A"), ("Bf", "A"), ("Dd", "C"), ("Df", "C")):
         beside = matrix.replace("D", "B")
         kept = []
@@ -225,7 +225,7 @@ def _carried(
                 kept.append((row, left[beside].index(column), text))
         if kept:
             entries[matrix] = kept
-    return replace(uncertain, entries={name: tuple(found) for name, found in entries.items()})
+    return replace(uncertain, entries={name: tuple(items) for name, items in entries.items()})
 
 
 def _units(units: Mapping[str, str], of: Mapping[str, str]) -> dict[str, str]:

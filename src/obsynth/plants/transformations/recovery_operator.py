@@ -78,17 +78,17 @@ class RecoveryOperator:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data: the parts of the sparse matrices as arrays."""
-        found: dict[str, Any] = {"counts": list(self.counts), "states": dict(self.states), "noise": self.noise_kept}
+        data: dict[str, Any] = {"counts": list(self.counts), "states": dict(self.states), "noise": self.noise_kept}
         for name in ("dynamic", "algebraic", "coupling", "right"):
             matrix = csr(getattr(self, name))
-            found[name] = {
+            data[name] = {
                 "rows": matrix.shape[0],
                 "columns": matrix.shape[1],
                 "values": matrix.data,
                 "indices": matrix.indices.astype(np.float64),
                 "starts": matrix.indptr.astype(np.float64),
             }
-        return found
+        return data
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RecoveryOperator:
@@ -114,18 +114,18 @@ def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:
     rows, columns = np.flatnonzero(suspicious.any(axis=1)), np.flatnonzero(suspicious.any(axis=0))
     if not rows.size:
         return solution
-    found = solution.copy()
+    cleaned = solution.copy()
     part = np.ix_(rows, columns)
     if len(rows) > SIZE_SAMPLES * len(columns):
         # Many rows: almost all of them are decided by an estimate.
         usual = CANCELLATION_TOLERANCE * factor.usual_size_of_terms(solution[:, columns])[rows]
         nothing = np.abs(solution[part]) <= usual / MEAN_FACTOR
-        found[part] = np.where(nothing, 0.0, solution[part])
+        cleaned[part] = np.where(nothing, 0.0, solution[part])
         open_still = ~nothing & (np.abs(solution[part]) <= usual * MEAN_FACTOR * np.sqrt(factor.size))
         rows = rows[open_still.any(axis=1)]
         if not rows.size:
-            return found
+            return cleaned
         part = np.ix_(rows, columns)
     terms = factor.size_of_terms(solution[:, columns], rows)
-    found[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, found[part], 0.0)
-    return found
+    cleaned[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, cleaned[part], 0.0)
+    return cleaned

@@ -81,9 +81,9 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     if count == rounding_rank(units):
         return None
     picked = [int(moving[place]) for place in _most_independent(units, count)]
-    found = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
+    combinations = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
     q = np.zeros((len(shown), count))
-    q[moving] = found * lengths[moving, None] / lengths[picked]
+    q[moving] = combinations * lengths[moving, None] / lengths[picked]
     weights = _weights(q, own.outputs[:, None] * plant.Dw) * own.outputs / own.outputs[picked, None]
     merged = {name: weights @ getattr(plant, name) for name in ("C", "D", "Df", "Dd", "Dw")}
     names = [plant.output_names[i] for i in picked]
@@ -105,8 +105,8 @@ def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
     q = np.zeros((len(shown), count))
     if count:
         unit_rows = shown[picked] / lengths[picked, None]
-        found = np.linalg.lstsq(unit_rows.T, units.T, rcond=None)[0].T
-        q[moving] = but_rounding(found, np.ones_like(found)) * lengths[moving, None] / lengths[picked]
+        combinations = np.linalg.lstsq(unit_rows.T, units.T, rcond=None)[0].T
+        q[moving] = but_rounding(combinations, np.ones_like(combinations)) * lengths[moving, None] / lengths[picked]
         q[picked] = np.eye(count)
     return picked, q, exact
 

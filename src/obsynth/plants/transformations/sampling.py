@@ -148,11 +148,11 @@ def _held(A: FloatArray, signals: FloatArray, step: float) -> tuple[FloatArray, 
 def _rounded_once(block: FloatArray, step: float) -> FloatArray | None:
     """Return ``exp(A h)`` in which every entry is rounded once; ``None`` where its balls are too wide."""
     with flint.ctx.workprec(SQUARING_BITS):
-        found = as_ball((arb_matrix(block) * flint.arb(float(step))).exp())
-    size = np.abs(found.midpoint)
-    if not np.max(found.radius, initial=0.0) <= CANCELLATION_TOLERANCE * np.max(size, initial=0.0):
+        exponential = as_ball((arb_matrix(block) * flint.arb(float(step))).exp())
+    size = np.abs(exponential.midpoint)
+    if not np.max(exponential.radius, initial=0.0) <= CANCELLATION_TOLERANCE * np.max(size, initial=0.0):
         return None
-    return np.where(size > found.radius, found.midpoint, 0.0)
+    return np.where(size > exponential.radius, exponential.midpoint, 0.0)
 
 
 def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:

@@ -55,9 +55,9 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> Transformation | None:
     if factor.singular:
         return None
     right = _side_by_side(algebraic_rows @ a @ dynamic, algebraic_rows @ csr(signals))
-    found, backward = factor.solve_with_error(right.toarray())
-    found[:, count:] = without_rounding(factor, found[:, count:])
-    solution = -found
+    solved, backward = factor.solve_with_error(right.toarray())
+    solved[:, count:] = without_rounding(factor, solved[:, count:])
+    solution = -solved
     kept = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
     mass = sparse_factor(dynamic_rows @ csr(plant.E) @ dynamic)
     moved, backward_of_e = mass.solve_with_error(
@@ -197,8 +197,8 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
     """Return the powers of two that bring the rows, then the columns, of ``[E A]`` near one."""
 
     def peaks(matrix: Any) -> FloatArray:
-        found = np.asarray(scipy.sparse.csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
-        return np.asarray(found, dtype=np.float64)
+        largest = np.asarray(scipy.sparse.csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
+        return np.asarray(largest, dtype=np.float64)
 
     rows = 1.0 / power_of_two_below(np.maximum(peaks(e.T), peaks(a.T)))
     scaled = [matrix.multiply(rows[:, None]) for matrix in (e, a)]
@@ -218,7 +218,7 @@ def not_index_one(
     if not factor.exactly_singular and smallest > RANK_TOLERANCE:
         return said or PreconditionError("", condition="index")
     generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
-    regular = any(not found.singular for found in generic)
+    regular = any(not verdict.singular for verdict in generic)
     if regular:
         equations, variables = _leading(algebraic_rows, algebraic, left, right, inner)
     else:

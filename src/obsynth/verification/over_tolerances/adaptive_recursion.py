@@ -101,16 +101,16 @@ def thresholds_of_records(
     runs, steps, _ = estimates.shape
     p, *_, no = bound.counts
     shapes = (no,), (p, no), (no,), (no,), (no,)
-    found = Thresholds(*(np.empty((runs, steps, *shape)) for shape in shapes))
+    thresholds = Thresholds(*(np.empty((runs, steps, *shape)) for shape in shapes))
     state = AdaptiveState.of(bound, (runs,))
     # A few samples at a time stay in the processor's cache.
     size = max(1, SAMPLES_AT_ONCE // max(1, runs))
     for k in range(0, steps, size):
         part = slice(k, k + size)
         state, samples = _adaptive_samples(bound, state, estimates[:, part], inputs[:, part], outputs[:, part])
-        for whole, some in zip(found, samples, strict=True):
+        for whole, some in zip(thresholds, samples, strict=True):
             whole[:, part] = some
-    return found
+    return thresholds
 
 
 def adaptive_step(
@@ -119,9 +119,9 @@ def adaptive_step(
     """Take one sample of one run: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it
     too."""
     one = state._replace(**{name: getattr(state, name)[None] for name in _ARRAYS})
-    after, found = _adaptive_samples(bound, one, estimates[None, None], inputs[None, None], outputs[None, None])
+    after, thresholds = _adaptive_samples(bound, one, estimates[None, None], inputs[None, None], outputs[None, None])
     return after._replace(**{name: getattr(after, name)[0] for name in _ARRAYS}), Thresholds(
-        *(item[0, 0] for item in found)
+        *(item[0, 0] for item in thresholds)
     )
 
 
@@ -222,6 +222,6 @@ def _channels(bound: AdaptiveBound, rows: FloatArray) -> FloatArray:
 def _continued(ring: FloatArray, count: int) -> FloatArray:
     """Return a ring ``(runs, L, n)`` with room for further rows behind it."""
     runs, length, width = ring.shape
-    found = np.empty((runs, length + count, width))
-    found[:, :length] = ring
-    return found
+    longer = np.empty((runs, length + count, width))
+    longer[:, :length] = ring
+    return longer

@@ -213,14 +213,14 @@ def _fault_columns(
             condition="fault interval",
         )
     chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]
-    found = affine_block([chosen]) + (-target)
-    if float(np.max(_missed(found, offsets), initial=0.0)) > IDENTITY_SHARE:
+    columns = affine_block([chosen]) + (-target)
+    if float(np.max(_missed(columns, offsets), initial=0.0)) > IDENTITY_SHARE:
         raise PreconditionError(
             "The estimate of a fault, or of the state, depends on how the fault came about: it has no guaranteed "
             "interval (a filter that estimates each sample of a fault on its own has one).",
             condition="fault interval",
         )
-    return found
+    return columns
 
 
 def _picked_rows(
@@ -241,10 +241,10 @@ def _picked_rows(
 
 def _at_earlier_samples(columns: AffineMatrix, earlier: NDArray[np.bool_], count: int) -> AffineMatrix:
     """Return columns of faults, of which late ones have the constants of an earlier sample: as many constants more."""
-    found = _with_more(columns, count)
-    found.parts[count:, :, earlier] = found.parts[:count, :, earlier]
-    found.parts[:count, :, earlier] = 0.0
-    return found
+    doubled = _with_more(columns, count)
+    doubled.parts[count:, :, earlier] = doubled.parts[:count, :, earlier]
+    doubled.parts[:count, :, earlier] = 0.0
+    return doubled
 
 
 def _with_more(matrix: AffineMatrix, count: int) -> AffineMatrix:

@@ -48,15 +48,15 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     if uncertain is None:
         return plant
     if uncertain.written is None:
-        found = plant.replace(**uncertain.filled(as_written(plant, uncertain), values), uncertainty=None)
+        single = plant.replace(**uncertain.filled(as_written(plant, uncertain), values), uncertainty=None)
     else:
         bare = plant_as_written_at(plant, uncertain, values)
         for kind, size in uncertain.steps:
             bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
-        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}, uncertainty=None)
+        single = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}, uncertainty=None)
     # It is no family any more, but knows which of its inputs is one in every row, if one is.
     shift = uncertain.shift
-    return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found
+    return single.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else single
 
 
 def plant_as_written_at(
@@ -160,7 +160,7 @@ def acting_like_faults(plant: DescriptorSystem) -> tuple[str, ...]:
     numbers = as_written(plant, uncertain)
     affine = uncertain.affine(numbers, uncertain.box)
     faults = np.vstack([numbers["Bf"], numbers["Df"]])
-    found = []
+    names = []
     for i, name in enumerate(uncertain.box.names):
         # What multiplies the same signal stands in one column: derivative of the state, state, u, f, d.
         zero = np.zeros((plant.ny, len(numbers["A"])))
@@ -169,8 +169,8 @@ def acting_like_faults(plant: DescriptorSystem) -> tuple[str, ...]:
         directions = _range(np.vstack([np.hstack(above), np.hstack(below)]))
         both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
         if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
-            found.append(name)
-    return tuple(found)
+            names.append(name)
+    return tuple(names)
 
 
 def _range(effects: FloatArray) -> FloatArray:

@@ -146,16 +146,16 @@ def _plain(structure: ErrorStructure, left: FloatArray, powers: FloatArray) -> F
     """Return ``|left Az^j b|`` (absolute values inside for remainders) for all j."""
     own, inner = len(structure.owner), structure.effects[structure.rows[0]]
     shown, slack = left @ powers, power_rounding(left, powers)
-    found = np.concatenate([np.abs(shown @ inner[:, :own]), np.abs(shown) @ np.abs(inner[:, own:])], axis=2)
-    return np.asarray(found + slack @ np.abs(inner))
+    sizes = np.concatenate([np.abs(shown @ inner[:, :own]), np.abs(shown) @ np.abs(inner[:, own:])], axis=2)
+    return np.asarray(sizes + slack @ np.abs(inner))
 
 
 def _response_sizes(structure: ErrorStructure, rows: FloatArray, powers: FloatArray) -> FloatArray:
-    found = _plain(structure, rows, powers)
+    sizes = _plain(structure, rows, powers)
     if structure.single == len(rows):
-        return found
-    largest = found[:, structure.single :].max(axis=1, keepdims=True)
-    return np.concatenate([found[:, : structure.single], largest], axis=1)
+        return sizes
+    largest = sizes[:, structure.single :].max(axis=1, keepdims=True)
+    return np.concatenate([sizes[:, : structure.single], largest], axis=1)
 
 
 def loop_radius(responses: Responses) -> float:
@@ -165,14 +165,14 @@ def loop_radius(responses: Responses) -> float:
 
 def same_sample_inverse(responses: Responses) -> FloatArray:
     """Return a bound of ``(I - D0)^-1``; `PreconditionError` where the loop at one sample does not contract."""
-    found = inverse_bound(responses.same)
-    if found is None:
+    inverse = inverse_bound(responses.same)
+    if inverse is None:
         raise PreconditionError(
             f"No bound: the loop at one and the same sample has radius {spectral_radius_bound(responses.same):.3g}, "
             "which must be below 1. Give smaller tolerances of C and D.",
             condition="same-sample loop",
         )
-    return found
+    return inverse
 
 
 def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: float) -> float:

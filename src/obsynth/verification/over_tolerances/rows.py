@@ -106,9 +106,9 @@ def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float
     family = affine_plant(plant, replace(box, constants=alone))
     if len(family.coordinates) != plant.nx:
         return float("inf")
-    found = []
+    differences = []
     for name in UNCERTAIN_MATRICES:
         stored, middle = np.asarray(dense(getattr(plant, name))), family.matrices[name]
         wanted = stored @ family.coordinates if name in ("E", "A", "C") else stored
-        found.append(relative_difference(wanted, middle.center, middle.radius))
-    return float(np.max(found))
+        differences.append(relative_difference(wanted, middle.center, middle.radius))
+    return float(np.max(differences))

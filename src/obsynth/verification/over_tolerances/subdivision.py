@@ -114,15 +114,15 @@ def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], Fl
     def singular(point: FloatArray) -> bool:
         return bool(np.linalg.slogdet(point)[0] * sign <= 0.0)
 
-    found = subdivided(build, count, invertible, singular, exact_at)
-    if found.at is None:
-        return found
+    decision = subdivided(build, count, invertible, singular, exact_at)
+    if decision.at is None:
+        return decision
     # Where, between the middle of the box and the point that fails, it begins to fail.
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
         between = (low + high) / 2.0
-        low, high = (low, between) if singular(exact_at(between * found.at)) else (between, high)
-    return BoxVerdict(found.verdict, found.boxes, np.asarray(high * found.at))
+        low, high = (low, between) if singular(exact_at(between * decision.at)) else (between, high)
+    return BoxVerdict(decision.verdict, decision.boxes, np.asarray(high * decision.at))
 
 
 def proved_stable(
@@ -177,8 +177,8 @@ def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
 def _lyapunov(a: FloatArray, *, discrete: bool) -> FloatArray:
 
     weight = np.eye(len(a))
-    found = discrete_lyapunov(a.T, weight) if discrete else continuous_lyapunov(a.T, -weight)
-    return np.asarray((found + found.T) / 2.0)
+    solution = discrete_lyapunov(a.T, weight) if discrete else continuous_lyapunov(a.T, -weight)
+    return np.asarray((solution + solution.T) / 2.0)
 
 
 def _energy_coordinates(a: FloatArray, *, discrete: bool) -> tuple[FloatArray, FloatArray]:
@@ -217,11 +217,11 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
         )
 
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
-        found = written.affine(numbers, written.box.part(lower, upper))
-        return affine_block([[found["E"].after(dynamic)], [found["A"].after(algebraic)]])
+        families = written.affine(numbers, written.box.part(lower, upper))
+        return affine_block([[families["E"].after(dynamic)], [families["A"].after(algebraic)]])
 
     def exactly(q: FloatArray) -> FloatArray:
-        found = written.filled(numbers, written.box.values(q))
-        return np.vstack([dynamic @ found["E"], algebraic @ found["A"]])
+        matrices = written.filled(numbers, written.box.values(q))
+        return np.vstack([dynamic @ matrices["E"], algebraic @ matrices["A"]])
 
     return proved_regular(build, len(written.box.names), exactly)
