@@ -25,6 +25,11 @@ def a_kind(value: Any) -> str:
     return f"an {name}" if name[:1].lower() in "aeio" else f"a {name}"
 
 
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun, for a message: ``1 row``, ``2 rows``."""
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def _plain(value: Any) -> Any:
     """Return an attribute of an error as plain data."""
     if isinstance(value, complex):

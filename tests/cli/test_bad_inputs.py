@@ -273,7 +273,7 @@ SHAPES = [
     Case("Bw too long", put("plant", "Bw", zeros(5, 1)), "Bw is 5 by 1, but 4 by 1 is needed"),
     Case("Dw too short", put("plant", "Dw", zeros(2, 1)), "Dw is 2 by 1, but 3 by 1 is needed"),
     Case("S of a wrong shape", put("method", "options", "S", eye(4)), "S is 4 by 4"),
-    Case("too few names", put("plant", "state_names", ["a"]), "state_names has 1 name(s), but there are 4"),
+    Case("too few names", put("plant", "state_names", ["a"]), "state_names has 1 name, but the plant has 4 states"),
     Case("repeated names", put("plant", "output_names", ["a", "b", "a"]), "output_names repeats 'a'"),
     Case("one state measured twice", put("plant", "C", {"outputs": ["x2", "x2"]}), "repeats 'x2'"),
     Case("unknown output", put("plant", "C", {"outputs": ["x2", "x9"]}), "C has no signal named 'x9'"),
@@ -425,7 +425,7 @@ PRECONDITIONS = [
         "Needed: rank F = 2.",
         signals=["f2"],
     ),
-    impossible("more faults than outputs", put("plant", "Bf", eye(4)), "nf <= ny", "4 faults and 3 output(s)"),
+    impossible("more faults than outputs", put("plant", "Bf", eye(4)), "nf <= ny", "4 faults and 3 outputs"),
     impossible("no fault", drop("plant", "Bf"), "faults", "at least one fault"),
     impossible(
         "zero on the unit circle",

@@ -56,7 +56,7 @@ CASES: dict[str, tuple[dict, dict, str, int, tuple[str, ...], dict]] = {
         {"condition": "(D2) zeros", "mode": [0.3, 0.0], "signals": ["hidden"]}),
     "more unknown inputs than outputs": (
         {**PAPER, "Bd": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}, {}, "PreconditionError", 3,
-        ("nd <= ny", "3 unknown input(s), 2 output(s)"), {"signals": ["d1", "d2", "d3"]}),
+        ("nd <= ny", "3 unknown inputs, 2 outputs"), {"signals": ["d1", "d2", "d3"]}),
     "a model order so high that the pair is lost": (
         PAPER, {"fault_model": {"polynomial": 40}}, "PreconditionError", 3,
         ("order of the fault model", "at the zero 0.5", "Lower its order"),

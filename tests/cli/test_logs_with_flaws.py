@@ -262,10 +262,10 @@ def test_calibrations_find_the_noise_of_the_clean_log_with_each_flaw(folder: Pat
     true = 1e-6 if kind == "nonlinear" else 1e-4
     assert all(0.75 * true <= variance <= 1.25 * true for variance in found.R.values())
     assert found.log["dt"] == pytest.approx(1e-3 if kind == "nonlinear" else 0.1, rel=1e-4)
-    said = {"gap": "5 rows are missing", "jitter": "The stamps jitter", "text cell": "count as missing",
-            "repeated stamp": "1 row(s) are left out", "out of order": "1 row(s) are left out",
-            "outlier": "count as not measured", "stuck sensor": "a stuck sensor repeats counts as not measured",
-            "blank row": "are missing: the ones before are held"}  # fmt: skip
+    said = {"gap": "5 rows are missing", "jitter": "The stamps jitter", "text cell": "counted as missing",
+            "repeated stamp": "1 row left out", "out of order": "1 row left out",
+            "outlier": "counted as not measured", "stuck sensor": "a stuck sensor repeats counts as not measured",
+            "blank row": "missing: the last one before is held"}  # fmt: skip
     assert said.get(flaw, "") in told
 
 
@@ -295,7 +295,7 @@ def test_infinite_outputs_count_as_not_measured_and_rows_without_stamps_are_name
     plant, data = spec_of("linear").plant, clean("linear")
     data.loc[60, "yb"] = np.inf
     found = obsynth.calibrate(plant, data, {}, input_delay=0, starts=1)
-    assert "1 value(s) of yb are infinite and count as not measured." in found.verdict
+    assert "1 infinite value of yb counted as not measured." in found.verdict
     data.loc[61, "time"] = np.nan
     with pytest.raises(obsynth.SpecError, match="Row 61, counted from 0, has no time stamp"):
         obsynth.calibrate(plant, data, {})

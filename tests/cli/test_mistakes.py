@@ -9,6 +9,7 @@ import pytest
 import obsynth
 from obsynth.cli.examples import EXAMPLES
 from obsynth.cli.main import VERBS, main, obsynth_parser
+from obsynth.plants.signal_names import suggestion
 
 ROOT = Path(__file__).parents[2]
 THERMAL = ROOT / "docs/examples/thermal/spec.yaml"
@@ -179,3 +180,76 @@ def test_two_options_that_are_misspelt_are_two_sentences(capsys: pytest.CaptureF
         main(["export", "--gians", "g.json", "--ot", "x.c"])
     told = capsys.readouterr().err
     assert "There is no option --gians. Did you mean --gains? There is no option --ot. Did you mean --to or " in told
+
+
+@pytest.mark.parametrize(
+    ("method", "told"),
+    [
+        (
+            "{id: ui-pi-observer, gamma: 2}",
+            "method.gamma: unknown key. Write options below method.options, as options: {",
+        ),
+        ("{id: ui-pi-observer, options: {gamma: 2}}", "unknown key. It is an option of fault-estimation-filter"),
+        ("{id: ui-pi-observer, options: {xyzzy: 2}}", "method.options.xyzzy: unknown key. The options are "),
+        ("{id: ui-pi-observer, options: {pole: [0.5]}}", "method.options.pole: unknown key. Did you mean 'poles'?"),
+        ("{options: {gama: 2}}", "method.options.gama: no method has this option. Did you mean 'gamma'?"),
+        ("ui-pi-observer", "not the text 'ui-pi-observer'. Write method: {id: ui-pi-observer}."),
+        ("{id: ui-pi-obsever}", "Did you mean 'ui-pi-observer'?"),
+    ],
+)
+def test_an_option_in_the_wrong_place_is_told_its_own(method: str, told: str, tmp_path, capsys) -> None:
+    head, _, _ = THERMAL.read_text(encoding="utf-8").partition("\nmethod:")
+    (tmp_path / "spec.yaml").write_text(f"{head}\nmethod: {method}\n", encoding="utf-8")
+    assert main(["design", "--system", str(tmp_path / "spec.yaml"), "--quiet"]) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"),
+    [
+        ("state_name", " Did you mean 'state_names'?"),
+        ("WALL", " Did you mean 'wall'?"),
+        ("xhat[y]", " Did you mean 'xhat[x]' or 'fhat[y]'?"),
+        ("zzz", ""),
+    ],
+)
+def test_names_much_farther_than_the_closest_are_not_suggested(wrong: str, near: str) -> None:
+    assert (
+        suggestion(wrong, ["state_names", "fault_names", "noise_names", "wall", "walls", "xhat[x]", "fhat[y]"]) == near
+    )
+
+
+def test_what_there_is_stands_in_the_message_where_nothing_is_close() -> None:
+    given = {"A": [[0.5]], "C": [[1.0]], "dt": 1.0}
+    with pytest.raises(obsynth.SpecError, match=r"no signal named 'z'\. There are: y1\."):
+        obsynth.DescriptorSystem(**given, sensor_noise={"z": 0.1})
+    with pytest.raises(obsynth.SpecError, match=r"Bf=\[\[1\]\] for a column or Bf=\[\[1\]\] for a row"):
+        obsynth.DescriptorSystem(**given, Bf=[1])
+    with pytest.raises(obsynth.SpecError, match=r"fault_names has 2 names, but the plant has 1 fault \(column of Bf"):
+        obsynth.DescriptorSystem(**given, Bf=[[1]], fault_names=["a", "b"])
+
+
+def test_a_plant_without_faults_is_not_said_to_have_some() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError) as refused:
+        obsynth.fault_estimation_filter(plant)
+    assert "Name the fault to estimate in Bf or Df." in str(refused.value)
+    assert "aults can be estimated" not in str(refused.value)
+    assert "Neither" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--time-column", "timestamp"], "Did you mean 'Timestamp'? Map it: --map time=Timestamp."),
+        (["--time-column", "Timestamp", "--map", "air=luft"], "Map it: --map air=YOUR_COLUMN."),
+        (["--time-column", "Timestamp", "--map", "air=AIR"], "Did you mean 'air'? Map it: --map air=air."),
+    ],
+)
+def test_a_column_that_is_missing_is_mapped_by_its_signal(words: list[str], told: str, tmp_path, capsys) -> None:
+    log = "Timestamp,power,heater,air,wall\n0,100,175,147,120\n10,100,175,147,120\n"
+    (tmp_path / "log.csv").write_text(log, encoding="utf-8")
+    gains = str(tmp_path / "oven.gains.json")
+    assert main(["design", "--system", str(THERMAL), "--output", gains, "--quiet"]) == 0
+    assert main(["run", "--gains", gains, "--data", str(tmp_path / "log.csv"), *words, "--quiet"]) == 2
+    assert told in capsys.readouterr().err

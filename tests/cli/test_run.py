@@ -149,7 +149,7 @@ def test_a_word_among_numbers_is_a_missing_sample(gains, capsys, word):
     assert run(gains) == 0
     told = capsys.readouterr()
     assert told.out == "8 rows: 5 warm-up, 1 ok, 1 gap, 1 recovering.\n"
-    assert f"1 cell(s) of 'x2' hold no number and count as missing, first {word!r} in row 7" in told.err
+    assert f"1 cell of 'x2' without a number: counted as missing, first {word!r} in row 7" in told.err
 
 
 BAD_LOGS = {

@@ -183,7 +183,7 @@ def test_names_units_and_sources_are_inside(design, tmp_path, version, monkeypat
     assert variables["x2"].causality == "input"
     assert variables["x2"].unit == variables["xhat[x2]"].unit == "m"
     assert variables["fhat[actuator 1]"].unit == "V"
-    assert "delayed by 1 sample(s)" in variables["fhat[actuator 1]"].description
+    assert "delayed by 1 sample" in variables["fhat[actuator 1]"].description
     assert float(variables["operating_point[u1]"].start) == 2.0
     with zipfile.ZipFile(path) as unit:
         names = unit.namelist()

@@ -175,7 +175,7 @@ def test_values_that_their_status_calls_bad_are_missing(design, frame, tmp_path,
     same(design, data, frame.assign(level=frame["level"].where(~bad)))
     (text,) = obsynth.run_on_data(design, data).warnings
     assert text.startswith(
-        f"3 cell(s) of 'level' count as missing, as '{name}' says so, first 'Bad (no data)' in row 13"
+        f"3 cells of 'level' counted as missing, as '{name}' says so, first 'Bad (no data)' in row 13"
     )
 
 

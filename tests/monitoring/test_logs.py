@@ -143,7 +143,7 @@ def test_wrong_stamps_are_named_with_the_row(design, cells, message):
 
 def test_the_time_column_may_be_called_otherwise(design, frame, wanted):
     log = frame.rename(columns={"time": "Timestamp"})
-    with pytest.raises(SpecError, match=r"If 'Timestamp' is the time: --time-column 'Timestamp'"):
+    with pytest.raises(SpecError, match=r"If 'Timestamp' is the time: --time-column Timestamp"):
         obsynth.run_on_data(design, log)
     same(obsynth.run_on_data(design, log, time_column="Timestamp", thresholds=THRESHOLDS), wanted)
 
@@ -323,7 +323,7 @@ def test_words_are_bad_samples_wherever_they_stand_and_however_a_log_is_read(des
         found = obsynth.run_on_data(design, data, chunk_rows=rows)
         pd.testing.assert_frame_equal(found.table, wanted)
         (said,) = (text for text in found.warnings if "flow" in text)
-        assert said.startswith("150 cell(s) of 'flow'")
+        assert said.startswith("150 cells of 'flow'")
         assert said.endswith(f"first 'Bad' in row {first + 1}.")
 
 
@@ -357,4 +357,4 @@ def test_words_without_stamps_and_in_a_mapping_are_bad_samples_of_a_calibration(
     for data in (tmp_path / "log.csv", tmp_path / "log.parquet", log, mapping):
         found = read_log(data, ["valve"], ["flow", "level"], dt=0.5)
         assert np.flatnonzero(np.isnan(found.y[:, 0])).tolist() == [*range(50), 700]
-        assert any(note.startswith("51 cell(s) of 'flow'") for note in found.notes)
+        assert any(note.startswith("51 cells of 'flow'") for note in found.notes)

@@ -154,7 +154,7 @@ def test_remarks_before_the_header_are_passed_over_and_told(design, frame, tmp_p
     path = tmp_path / "log.csv"
     path.write_text(f"Logger: X, serial 12\nStarted,2026-05-01\n\n{text}", encoding="utf-8")
     run = _same(design, path, frame)
-    assert any("3 line(s) before the header" in told and "'Logger: X, serial 12'" in told for told in run.warnings)
+    assert any("3 lines before the header" in told and "'Logger: X, serial 12'" in told for told in run.warnings)
     assert log_table(path, ["level"])[1] == list(frame.columns)
     # What names no column anywhere is told by its own first line.
     path.write_text("a,b\n1,2\n3,4\n", encoding="utf-8")

@@ -54,8 +54,8 @@ def test_a_plant_without_algebraic_states_inputs_or_parameters():
 BAD = {
     "no system": (lambda: obsynth.from_casadi(3, states=STATES), "system is 3: give a casadi.Function"),
     "key": (lambda: obsynth.from_casadi({**tank(), "w": 1}, states=STATES), "unknown key 'w'; there are: x, z, u, p"),
-    "states": (lambda: obsynth.from_casadi(tank(), states={"x": 1.0}), r"states names 1 value\(s\), but"),
-    "inputs": (lambda: obsynth.from_casadi(tank(), states=STATES), r"inputs names 0 value\(s\), but the system has 1"),
+    "states": (lambda: obsynth.from_casadi(tank(), states={"x": 1.0}), r"states names 1 value, but"),
+    "inputs": (lambda: obsynth.from_casadi(tank(), states=STATES), r"inputs names 0 values, but the system has 1"),
     "names": (
         lambda: obsynth.from_casadi(casadi.Function("f", [casadi.SX.sym("a")], [1]), states={"a": 1.0}), "'i0': name",
     ),
@@ -70,7 +70,7 @@ BAD = {
     ),
     "no y": (
         lambda: obsynth.from_casadi({k: v for k, v in SAME.items() if k != "y"}, states=STATES, inputs=INPUTS,
-                                    parameters=PARAMETERS), r"0 output\(s\) y",
+                                    parameters=PARAMETERS), r"0 outputs y",
     ),
     "direct": (
         lambda: obsynth.from_casadi({**SAME, "y": SAME["u"]}, states=STATES, inputs=INPUTS, parameters=PARAMETERS),

@@ -143,7 +143,7 @@ def nan_at_5(k):
         ({"horizon": 10**9}, "1000000000 steps is too long for .*Leave the horizon out", "horizon"),
         ({"constants": {"k": 1.0}}, "constants names 'k'", "constants"),
         ({"constants": {"half": float("nan")}}, "'half' is nan", "constants.half"),
-        ({"state_names": ["a"]}, r"1 name\(s\), but there are 2", "state_names"),
+        ({"state_names": ["a"]}, r"1 name, but the plant has 2 states", "state_names"),
         ({"units": {"zz": "m"}}, "'zz', which is no signal", "units"),
     ],
 )

@@ -276,7 +276,7 @@ def test_the_sentence_of_robustness_tells_each_verdict(files: dict[str, Path]) -
     assert "regular of index 1 (proved), stable (proved)" in told()
     assert "stable (not decided)" in told(stable="open")
     assert "stable (refuted at p = 1.25)" in told(stable="refuted", breaking={"p": 1.25})
-    assert "but for 1 mode(s) that no constant touches" in told(untouched=[[0.0, 0.0]])
+    assert "but for 1 mode that no constant touches" in told(untouched=[[0.0, 0.0]])
     assert "within bounds for ever (loop radius 0.999)" in told(loop_radius=0.999)
     assert "may grow (loop radius 1)" in told(loop_radius=1.0)
     assert "no bound of the observer's error" in told(loop_radius=None, largest_factor=None)

@@ -9,6 +9,7 @@ from importlib.resources import files
 
 import numpy as np
 
+from obsynth.errors import counted
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.numerics.arrays import FloatArray
@@ -453,7 +454,7 @@ def signal_comments(
     """Return the comments that name the signals of an array."""
     for i, name in enumerate(names):
         at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
-        late = f", delayed by {delays[i]} sample(s)" if delays and delays[i] else ""
+        late = f", delayed by {counted(delays[i], 'sample')}" if delays and delays[i] else ""
         unit = f", {quoted(units[name])}" if units.get(name) else ""
         yield comment(f"{array}[{i}]: {quoted(f'{column}[{name}]' if column else name)}{unit}{at}{late}")
 

@@ -18,6 +18,7 @@ from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import FaultModel
+from obsynth.plants.signal_names import suggestion
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.checks import Check
@@ -127,9 +128,11 @@ class Method(ABC):
         """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
         unknown = sorted(set(options) - set(field_types(cls)))
         if unknown:
-            listed = ", ".join(sorted(field_types(cls)))
+            known = sorted(field_types(cls))
+            near = suggestion(unknown[0], known) if len(unknown) == 1 else ""
             raise SpecError(
-                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path=OPTIONS_PATH
+                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(known)}.{near}",
+                path=OPTIONS_PATH,
             )
         return cls(**options)
 

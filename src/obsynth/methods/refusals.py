@@ -111,6 +111,9 @@ def with_advice(
             unclear=error.unclear,
         )
     error = _named_assumption(error, plant, method)
+    if not plant.nf and error.condition == "faults":
+        # No sensor makes a fault of none.
+        return error
     candidates = state_sensors(plant) if sensors is None else sensors
     sets = least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
@@ -149,7 +152,7 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, method:
         + (
             f"The states can be estimated beside faults that follow their models: {', '.join(alternatives)} {exist}."
             if states
-            else f"The faults can be estimated: {', '.join(alternatives)} {exist}."
+            else f"The {'faults' if plant.nf else 'states'} can be estimated: {', '.join(alternatives)} {exist}."
         ),
         condition=error.condition,
         mode=error.mode,

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TextIO, TypeVar, Union, get_args, ge
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from obsynth.errors import SpecError, a_kind
+from obsynth.errors import SpecError, a_kind, counted
 from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
 from obsynth.numerics.quantities import require_plain
 
@@ -157,7 +157,7 @@ def truth(value: Any, name: str) -> bool:
 
 def real_vector(value: Any, size: int, name: str) -> FloatArray:
     """Return ``(size,)`` finite real numbers; a single one may be given as such."""
-    refusal = SpecError(f"{name} must be {size} finite number(s).", path=name)
+    refusal = SpecError(f"{name} must be {counted(size, 'finite number')}.", path=name)
     try:
         vector = np.atleast_1d(real_array(value, name))
     except SpecError:
@@ -295,7 +295,11 @@ def _problem_with_kind(value: Any, name: str, kind: Any) -> str | None:
         elif plain != "NoneType" and not (option is str and Path in options):
             expected.append(_WORDS.get(plain, f"an obsynth.{plain}"))
     hint = _suggestion(value, [(get_origin(option) or option).__name__ for option in options])
-    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(expected))}.{hint}"
+    first, *more = dict.fromkeys(expected)
+    # The prefix once: an obsynth.DescriptorSystem, DAEModel or PolytopicSystem.
+    kinds = [first, *(text.removeprefix("an obsynth.") if "an obsynth." in first else text for text in more)]
+    listing = ", ".join(kinds[:-1]) + " or " + kinds[-1] if more else first
+    return f"{name} is {a_kind(value)}: give {listing}.{hint}"
 
 
 def _suggestion(value: Any, expected: Sequence[str]) -> str:

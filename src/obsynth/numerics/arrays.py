@@ -13,12 +13,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.quantities import require_plain
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
+
+#: A vector with at most this many entries is written as a matrix in a message.
+LONGEST_EXAMPLE = 6
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
@@ -147,7 +150,7 @@ def as_matrix(value: Any, name: str) -> FloatArray:
     if raw.ndim == 0:
         raw = raw.reshape(1, 1)
     if raw.ndim != 2:
-        raise SpecError(f"{name} has {raw.ndim} dimension(s): give a matrix (a list of rows).", path=name)
+        raise SpecError(f"{name} has {counted(raw.ndim, 'dimension')}: {_as_rows(raw, name)}.", path=name)
     matrix = raw.astype(np.float64)
     finite = np.isfinite(matrix)
     if not finite.all():
@@ -155,6 +158,15 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         entry = matrix[row - 1, column - 1]
         raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
     return read_only(matrix)
+
+
+def _as_rows(vector: NDArray[Any], name: str) -> str:
+    """Return how an array that is no matrix is written as one: a short vector as a column and as a row."""
+    if vector.ndim != 1 or not 0 < vector.size <= LONGEST_EXAMPLE:
+        return "give a matrix (a list of rows)"
+    entries = [str(entry) for entry in vector.tolist()]
+    column = ", ".join(f"[{entry}]" for entry in entries)
+    return f"give a list of rows, {name}=[{column}] for a column or {name}=[[{', '.join(entries)}]] for a row"
 
 
 def reachable(matrix: FloatArray) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from obsynth.errors import SolverError
+from obsynth.errors import SolverError, counted
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change, stabilising_gain
@@ -290,8 +290,9 @@ def _starting_filter(problem: GainProblem) -> Injection:
     if gain is None:
         raise SolverError(
             "No stable starting filter was found, although the existence conditions hold. Without feedback the error "
-            f"grows by a factor of up to {spectral_radius(problem.A):.3g} per sample, with {problem.measured} free "
-            "measurement(s) against it: a fault that moves the outputs little within its delay makes it grow fast, "
-            "and many unstable modes need more outputs. The result is inconclusive."
+            f"grows by a factor of up to {spectral_radius(problem.A):.3g} per sample, with "
+            f"{counted(problem.measured, 'free measurement')} against it: a fault that moves the outputs little "
+            "within its delay makes it grow fast, and many unstable modes need more outputs. The result is "
+            "inconclusive."
         )
     return Injection(gain, np.zeros((problem.Z.shape[0], problem.measured)))

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray, kind_of_entries, read_only
 
 Indices = NDArray[np.int64]
@@ -24,7 +24,7 @@ def as_sparse_matrix(value: Any, name: str) -> Any:
     if value.dtype.kind not in "fiu":
         raise SpecError(f"{name} holds {kind_of_entries(value.dtype)}: every entry must be a real number.", path=name)
     if value.ndim != 2:
-        raise SpecError(f"{name} has {value.ndim} dimension(s): give a matrix.", path=name)
+        raise SpecError(f"{name} has {counted(value.ndim, 'dimension')}: give a matrix.", path=name)
     copy = (value.copy() if value.format in ("csr", "csc") else value.tocsr(copy=True)).astype(np.float64)
     copy.sum_duplicates()
     bad = np.flatnonzero(~np.isfinite(copy.data))

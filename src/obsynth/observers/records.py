@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.plants.dae_signals import finite_vector
@@ -77,7 +77,7 @@ def _numbers(value: Any, name: str) -> FloatArray:
 def checked_record(value: Any, columns: int, name: str) -> FloatArray:
     """Return a record ``(samples, columns)``; one signal may be given as a plain list."""
     if value is None:
-        raise SpecError(f"{name} is missing: the observer needs {columns} signal(s).", path=name)
+        raise SpecError(f"{name} is missing: the observer needs {counted(columns, 'signal')}.", path=name)
     array = _numbers(value, name)
     if array.ndim == 1 and columns == 1:
         array = array.reshape(-1, 1)
@@ -90,7 +90,9 @@ def checked_sample(value: Any, count: int, name: str) -> FloatArray:
     """Return one sample ``(count,)``."""
     array = _numbers(value, name)
     if array.shape != (count,):
-        raise SpecError(f"{name} has shape {array.shape}, but the observer needs {count} number(s).", path=name)
+        raise SpecError(
+            f"{name} has shape {array.shape}, but the observer needs {counted(count, 'number')}.", path=name
+        )
     return array
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray
 
 
@@ -44,7 +44,7 @@ def require_inputs(u: FloatArray, names: tuple[str, ...], k: int) -> None:
     """Raise `SpecError` unless inputs ``u (nu,)`` are as many as their names; where one is infinite, or missing (NaN)
     before it was ever known."""
     if u.shape != (len(names),):
-        raise SpecError(f"u must be {len(names)} finite number(s) at k = {k}.", path="u")
+        raise SpecError(f"u must be {counted(len(names), 'finite number')} at k = {k}.", path="u")
     wrong = np.isinf(u) | (np.isnan(u) if k == 0 else False)
     if wrong.any():
         i = int(np.argmax(wrong))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_given
 from obsynth.plants.dae_fields import DAEFields
@@ -21,7 +21,9 @@ def step_length(dt: Any) -> float:
 def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:
     """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
-        raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
+        raise SpecError(
+            f"u is missing: the model has {counted(model.nu, 'input')}: {', '.join(model.input_names)}.", path="u"
+        )
     raw = np.zeros((samples or 0, 0)) if u is None else as_given(u, "u", "u has rows of different lengths.")
     if raw.ndim == 1 and model.nu == 1:
         raw = raw[:, None]
@@ -48,9 +50,9 @@ def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: s
     try:
         vector = np.atleast_1d(real_array(value, what))
     except SpecError:
-        raise SpecError(f"{what} must be {len(names)} finite number(s).", path=what) from None
+        raise SpecError(f"{what} must be {counted(len(names), 'finite number')}.", path=what) from None
     if vector.shape != (len(names),):
-        raise SpecError(f"{what} must be {len(names)} finite number(s): {', '.join(names)}.", path=what)
+        raise SpecError(f"{what} must be {counted(len(names), 'finite number')}: {', '.join(names)}.", path=what)
     for name, entry in zip(names, vector, strict=True):
         if not np.isfinite(entry):
             raise SpecError(f"{what}.{name} is {entry}: give a finite number.", path=f"{what}.{name}")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NAMED_SHARE
 
@@ -19,6 +19,19 @@ MOST_NAMES = 4
 
 #: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
 _UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
+
+#: A name that misses a wrong one by more than this many times the miss of the closest name is not suggested.
+MUCH_FARTHER = 2.5
+
+#: Argument with names -> what it names, as a message counts it: one, many.
+_COUNTED = {
+    "state_names": ("state", "states"),
+    "input_names": ("known input", "known inputs"),
+    "output_names": ("output", "outputs"),
+    "fault_names": ("fault (column of Bf and Df)", "faults (columns of Bf and Df)"),
+    "disturbance_names": ("unknown input (column of Bd and Dd)", "unknown inputs (columns of Bd and Dd)"),
+    "noise_names": ("noise input (column of Bw and Dw)", "noise inputs (columns of Bw and Dw)"),
+}
 
 #: So many letters of a name are taken as its beginning.
 LEAST_BEGINNING = 3
@@ -41,7 +54,8 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
-        raise SpecError(f"{what} has {len(given)} name(s), but there are {count} such signal(s).", path=what)
+        there = counted(count, *_COUNTED[what]) if what in _COUNTED else f"{count}"
+        raise SpecError(f"{what} has {counted(len(given), 'name')}, but the plant has {there}.", path=what)
     unwritable = [
         name
         for name in given
@@ -66,7 +80,7 @@ def index_of(name: str, names: Sequence[str], *, what: str) -> int:
     """Return the position of ``name``; the error suggests the closest names, or lists what there is."""
     if isinstance(name, str) and name in names:
         return list(names).index(name)
-    near = suggestion(name, names) or (f" There are: {listed(names)}." if names else " There are none.")
+    near = suggestion(name, names) or _there_are(names)
     raise SpecError(f"{what} has no signal named {name!r}.{near}", path=what)
 
 
@@ -76,29 +90,45 @@ def listed(texts: Sequence[str], *, most: int = 6) -> str:
     return f"{', '.join(texts[:most])}{more}"
 
 
+def _there_are(names: Sequence[str]) -> str:
+    return f" There are: {listed(names)}." if names else " There are none."
+
+
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
     known = list(names)
-    close = difflib.get_close_matches(str(name), known, n=3)
+    close = _closest(str(name), known)
     if not close and len(str(name)) >= LEAST_BEGINNING:
         close = [other for other in known if other.startswith(str(name))][:3]
     return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
+def _closest(name: str, known: Sequence[str]) -> list[str]:
+    """Return at most three names that are close to a wrong one, without those that are much farther than the best."""
+    alike = [other for other in known if other.casefold() == name.casefold()]
+    close = alike or difflib.get_close_matches(name, known, n=3)
+    missed = [1.0 - difflib.SequenceMatcher(None, other, name).ratio() for other in close]
+    return [other for other, miss in zip(close, missed, strict=True) if miss <= MUCH_FARTHER * missed[0]]
+
+
 def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
     """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
-    listed = sorted(known)
+    present = sorted(known)
     told = [
-        f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}"
+        f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), present)}"
         for name in given
-        if name not in listed
+        if name not in present
     ]
+    if len(told) == 1 and told[0].endswith("plant."):
+        told[0] += _there_are(present)
     raise_problems(told, f"{what} names {len(told)} that are no {kind} of the plant:", what)
 
 
 def require_picked(picked: Iterable[str], names: Sequence[str], *, what: str) -> None:
     """Raise one `SpecError` for all names that are not there, each with what may be meant."""
     wrong = [f"{what} has no signal named {name!r}.{suggestion(name, names)}" for name in picked if name not in names]
+    if len(wrong) == 1 and not wrong[0].endswith("?"):
+        wrong[0] += _there_are(names)
     raise_problems(wrong, f"{what} picks {len(wrong)} signals that do not exist:", what)
 
 

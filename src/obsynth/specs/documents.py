@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
-from obsynth.methods.registry import AUTO, REGISTRY
-from obsynth.numerics.arguments import is_whole
+from obsynth.methods.registry import AUTO, REGISTRY, method_class
+from obsynth.numerics.arguments import field_types, is_whole
 from obsynth.plants.signal_names import suggestion
 
 if TYPE_CHECKING:
@@ -238,6 +238,13 @@ def _options_of_any(raw_options: dict[str, Any], source: Path) -> dict[str, Any]
 
     if not raw_options:
         return {}
+    unknown = [name for name in raw_options if not _methods_with(name)]
+    if unknown:
+        known = {name for method in REGISTRY for name in field_types(method_class(method))}
+        problems = DocumentProblems(source, what="spec")
+        for name in unknown:
+            problems.add(f"method.options.{name}", f"no method has this option.{suggestion(name, sorted(known))}")
+        problems.raise_if_any()
     for method in REGISTRY:
         problems = DocumentProblems(source, what="spec")
         options = _validated(options_schema(method), raw_options, problems, prefix="method.options")
@@ -358,10 +365,11 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "extra_forbidden":
         known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
-        text = f"unknown key.{suggestion(key, known)}"
+        text = f"unknown key.{suggestion(key, known) or _option_hint(key, prefix, names, known)}"
     elif kind == "missing":
         needed = ": give the seconds between samples, or 0 for a plant in continuous time"
-        text = f"this key is missing{needed if key == 'dt' else ''}."
+        needed = {"dt": needed, "schema_version": ": write schema_version: 1"}.get(key, "")
+        text = f"this key is missing{needed}."
     elif kind in ("ragged_rows", "stack_shapes"):
         text = f"{item['msg']}."
     elif kind == "stated":
@@ -379,9 +387,27 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         expected = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else expected
         actual = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
         text = f"must be {expected}, not {actual}."
+        if location == ["method"] and isinstance(value, str):
+            text += f" Write method: {{id: {value}}}."
     words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
     place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
     return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
+
+
+def _option_hint(key: str, prefix: str, names: Sequence[str], known: Sequence[str]) -> str:
+    """Return what helps with a wrong key of a method, as a sentence after a blank: where an option belongs, which
+    methods have it, or which options there are."""
+    if names[:-1] == ["method"]:
+        return f" Write options below method.options, as options: {{{key}: ...}}." if _methods_with(key) else ""
+    if prefix != "method.options" or len(names) != 1:
+        return ""
+    takes = _methods_with(key)
+    return f" It is an option of {', '.join(takes)}." if takes else f" The options are {', '.join(known)}."
+
+
+def _methods_with(option: str) -> list[str]:
+    """Return the methods that have an option of this name."""
+    return [method for method in REGISTRY if option in field_types(method_class(method))]
 
 
 def _wanted_in_words(kind: str, context: Mapping[str, Any]) -> str:

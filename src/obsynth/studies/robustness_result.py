@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import freeze
@@ -232,7 +232,9 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
     box = "an exact model" if uncertain is None else uncertain.box.phrase
     where = ", ".join(f"{name} = {value:.6g}" for name, value in claims["breaking"].items())
     verdicts = {**VERDICTS, "refuted": f"refuted at {where}"} if where else VERDICTS
-    lasting = f" but for {len(claims['untouched'])} mode(s) that no constant touches" if claims["untouched"] else ""
+    lasting = (
+        f" but for {counted(len(claims['untouched']), 'mode')} that no constant touches" if claims["untouched"] else ""
+    )
     words = [
         f"regular of index 1 ({verdicts.get(claims['regular'])})",
         f"stable{lasting} ({verdicts.get(claims['stable'])})",

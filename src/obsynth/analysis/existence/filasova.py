@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import Condition, up_to_failure
 from obsynth.analysis.existence.plant_numbers import SystemFacts
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, reconsidered
+from obsynth.errors import counted
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import equilibrated_at
 from obsynth.numerics.ranks import equilibrate
@@ -132,7 +133,7 @@ def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
         float(plant.nf),
         float(plant.ny),
         source,
-        f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
+        f"{counted(plant.nf, 'fault')} and {counted(plant.ny, 'output')}. Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )
 
@@ -188,7 +189,7 @@ def _condition(
 def _detectable(facts: SystemFacts) -> Condition:
     modes = facts.zeros
     slowest = f", slowest real part {max(mode.real for mode in modes):.6g}" if modes else ""
-    detail = f"{len(modes)} unobservable mode(s){slowest}"
+    detail = f"{counted(len(modes), 'unobservable mode')}{slowest}"
     return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.analysis.dae_structure import identifiability, index_report
 from obsynth.analysis.existence.condition import Condition
-from obsynth.errors import SolverError, a_kind
+from obsynth.errors import SolverError, a_kind, counted
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import DAEFunctions
 
@@ -64,7 +64,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             float(model.nq),
             1.0,
             f"{SOURCE}, (3)",
-            f"{model.nq} parameter(s){note}",
+            f"{counted(model.nq, 'parameter')}{note}",
             of_the_method=True,
         )
 

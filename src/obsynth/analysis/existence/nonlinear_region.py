@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import Condition, up_to_failure
 from obsynth.analysis.existence.recursive import described_mode
 from obsynth.analysis.existence.statements import Evaluator
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, counted
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.operating_region import OperatingRegion, Slope
@@ -42,8 +42,8 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
     count = len(terms.nonlinearities)
     yield Condition(
         "constant E", "E is constant, its derivatives are independent, and no formula jumps", True, 1.0, 1.0, _SOURCE,
-        f"{terms.differential} differential state(s) and fault(s), "
-        f"{len(terms.names) - terms.differential} algebraic one(s), {count} nonlinearit{'y' if count == 1 else 'ies'}",
+        f"{counted(terms.differential, 'differential state or fault', 'differential states and faults')}, "
+        f"{len(terms.names) - terms.differential} algebraic, {counted(count, 'nonlinearity', 'nonlinearities')}",
         of_the_method=True,
     )  # fmt: skip
     if region is None:
@@ -64,7 +64,7 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         return
     yield Condition(
         "bounded slopes", "every nonlinearity has a bounded slope over the region", True, float(len(slopes)),
-        float(len(slopes)), _SOURCE, f"{len(slopes)} slope(s)",
+        float(len(slopes)), _SOURCE, f"{counted(len(slopes), 'slope')}",
         of_the_method=True,
     )  # fmt: skip
     yield Condition(

@@ -22,7 +22,7 @@ from obsynth.analysis.time_varying import (
     horizon_ranks,
     step_blocks,
 )
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import are_outside
 from obsynth.numerics.pencils import finite_zeros
@@ -85,7 +85,7 @@ def recursive_conditions(
         float(varying.nq),
         1.0,
         f"{SOURCE}, eq. (4)",
-        f"{varying.nq} parameter(s)",
+        f"{counted(varying.nq, 'parameter')}",
         of_the_method=True,
     )
     if not varying.nq:
@@ -169,7 +169,7 @@ def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
 
 
 def _decaying_modes(count: int) -> str:
-    return f"{count} unobservable mode(s), all of which decay" if count else "observable"
+    return f"{counted(count, 'unobservable mode')}, decaying" if count else "observable"
 
 
 def _hidden_modes(

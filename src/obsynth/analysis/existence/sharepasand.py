@@ -42,6 +42,7 @@ from obsynth.analysis.existence.statements import (
     reconsidered,
     zero_verdict,
 )
+from obsynth.errors import counted
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.invariant_zeros import Zero, is_outside, system_pencil, system_zeros, zero_at
 from obsynth.numerics.pencils import finite_zeros
@@ -102,7 +103,7 @@ def _decided(judge: Evaluator, model: Exosystem) -> Existence:
         float(rank),
         float(plant.ny),
         SOURCE,
-        f"{rank} unknown input(s), {plant.ny} output(s)"
+        f"{counted(rank, 'unknown input')}, {counted(plant.ny, 'output')}"
         + ("" if holds else ". Measure more, or leave an unknown input out."),
         signals=() if holds else plant.disturbance_names,
     )
@@ -135,7 +136,7 @@ def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
 
     def holding(facts: SystemFacts) -> Condition:
-        return _zeros(True, facts.normal_rank, facts.columns, f"{len(facts.zeros)} stable zero(s)")
+        return _zeros(True, facts.normal_rank, facts.columns, f"{counted(len(facts.zeros), 'stable zero')}")
 
     def lost(facts: SystemFacts) -> Condition:
         if not facts.full:

@@ -24,7 +24,7 @@ from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prep
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.zeros import hidden_faults
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, counted
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import Zero, zero_at
 from obsynth.numerics.spectra import pole_text
@@ -248,7 +248,9 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
         float(plant.nf),
         float(plant.ny),
         source,
-        "" if enough else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
+        ""
+        if enough
+        else f"{counted(plant.nf, 'fault')} and {counted(plant.ny, 'output')}. Measure more, or leave a fault out.",
         signals=() if enough else plant.fault_names,
     )
     alike = "some faults act nowhere, or in the same direction as others, and cannot be distinguished."
@@ -294,7 +296,7 @@ def _zero_condition(judge: Evaluator) -> Condition:
     def holding(facts: SystemFacts) -> Condition:
         largest = max((abs(value) for value in facts.zeros), default=0.0)
         largest_one = f", largest modulus {largest:.6g}" if facts.zeros else ""
-        return _fault_zeros(holds=True, value=largest, detail=f"{len(facts.zeros)} zero(s){largest_one}")
+        return _fault_zeros(holds=True, value=largest, detail=f"{counted(len(facts.zeros), 'zero')}{largest_one}")
 
     def lost(facts: SystemFacts) -> Condition:
         if not facts.full:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from obsynth.errors import counted
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.results.design import ObserverDesign
@@ -98,7 +99,7 @@ def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> FmuSignals:
 
 def _delayed(text: str, delay: int) -> str:
     """Return a description, with the delay of the estimate where it has one."""
-    return f"{text}, delayed by {delay} sample(s)" if delay else text
+    return f"{text}, delayed by {counted(delay, 'sample')}" if delay else text
 
 
 def _distinct(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:

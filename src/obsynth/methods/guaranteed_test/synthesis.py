@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
-from obsynth.errors import ObsynthError, PreconditionError, SolverError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError, counted
 from obsynth.methods.designing import design
 from obsynth.methods.guaranteed_test.existence import conditions, detectability
 from obsynth.methods.guaranteed_test.options import TestOptions
@@ -410,8 +410,8 @@ def _notes_of_rows(
     forever = problem.horizon is None
     rows = "every row from" if forever else f"the {len(of_row)} rows from"
     yield (
-        f"{len(thresholds)} linear programme(s) serve {rows} k = {question.samples} on, each proved: thresholds from "
-        f"{used.min():.6g} to {used.max():.6g}; the largest one is claimed."
+        f"{counted(len(thresholds), 'linear programme')} for {rows} k = {question.samples} on, each proved: "
+        f"thresholds from {used.min():.6g} to {used.max():.6g}; the largest one is claimed."
     )
     if without:
         yield (

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SpecError, counted
 from obsynth.monitoring.logs.clock import MOST_STALE
 from obsynth.monitoring.logs.log_tables import log_table, parsed_rows
+from obsynth.monitoring.logs.signals import time_advice
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -142,7 +143,7 @@ class RecordedLog:
             if len(rows):
                 listed = told_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
                 notes.append(
-                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured ({listed})."
+                    f"{counted(len(rows), 'value')} of {name} far from all others, counted as not measured ({listed})."
                 )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
 
@@ -201,7 +202,11 @@ def read_log(
 
     in_table = (columns or {}).get("time", "time") in table
     if not in_table and dt is None:
-        raise SpecError("The log has no column 'time': name it by columns, or give dt.", path="columns.time")
+        raise SpecError(
+            f"The log has no column 'time'; it has {', '.join(map(repr, names))}. "
+            f"{time_advice(names) or 'Name it by columns.'} In Python, dt stands for the stamps of an even log.",
+            path="columns.time",
+        )
     time = column("time") if in_table else np.asarray(np.arange(first, last) * float(dt or 0.0))
     u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
     y = np.column_stack([column(name) for name in output_names])
@@ -262,7 +267,7 @@ def _on_grid(
     notes = []
     stale = np.isfinite(time) & (time <= np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])))
     if stale.any() and not _longest(stale) > MOST_STALE:
-        notes.append(f"{int(stale.sum())} row(s) are left out, as their stamps do not rise.")
+        notes.append(f"{counted(int(stale.sum()), 'row')} left out: the stamps do not rise.")
         time, u, y = time[~stale], u[~stale], y[~stale]
     step, counts, jitter = _grid(time, dt, rows[0])
     if jitter.max(initial=0.0) > NOTED_JITTER:
@@ -273,7 +278,7 @@ def _on_grid(
         if not finite.any():
             raise bad_log("nan", f"The input {name!r} is nowhere finite in these rows.", path=f"log.{name}")
         if not finite.all():
-            notes.append(f"{int((~finite).sum())} value(s) of {name} are missing: the ones before are held.")
+            notes.append(f"{counted(int((~finite).sum()), 'value')} of {name} missing: the last one before is held.")
             places = np.maximum.accumulate(np.where(finite, np.arange(len(column)), np.argmax(finite)))
             u = u.copy()
             u[:, inputs.index(name)] = column[places]
@@ -281,7 +286,7 @@ def _on_grid(
         if not np.isfinite(column).any():
             raise bad_log("nan", f"The output {name!r} is nowhere finite in these rows.", path=f"log.{name}")
         if np.isinf(column).any():
-            notes.append(f"{int(np.isinf(column).sum())} value(s) of {name} are infinite and count as not measured.")
+            notes.append(f"{counted(int(np.isinf(column).sum()), 'infinite value')} of {name} counted as not measured.")
     y = np.where(np.isfinite(y), y, np.nan)
     places = np.concatenate([[0], np.cumsum(counts)])
     if (counts > 1).any():

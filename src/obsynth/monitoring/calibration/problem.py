@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, bad_log, quantum, refused, repeats
 from obsynth.monitoring.calibration.plants import CalibrationPlant
 from obsynth.monitoring.calibration.step_graphs import SampleGraphs, sample_graphs
@@ -118,7 +118,7 @@ def calibration_problem(
     """Return the problem, or say what is wrong with what is asked."""
     substeps = whole_number(substeps, "substeps")
     if not log.samples > 1:
-        raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
+        raise bad_log("too-short", f"The log has {counted(log.samples, 'row')}: a calibration needs more.")
     if not isinstance(unknown, Mapping):
         raise SpecError("unknown must be a mapping from names to [low, high], such as {k: [0.5, 2]}.", path="unknown")
     unknown = {**unknown, **plant.bounds}

@@ -336,7 +336,8 @@ def _sentences_on_log(
     if lost > NOTED_NATS:
         least = min(losses, key=lambda rows: losses[rows])
         sentences.append(
-            f"Inputs that act {least:+d} row(s) later would be better by {lost:.1f} nats: see input_delay."
+            f"Inputs that act {least:+d} {'row' if abs(least) == 1 else 'rows'} later would be better by {lost:.1f} "
+            "nats: see input_delay."
         )
     if error is not None:
         used = "Radau" if problem.integration == "radau" else "backward Euler"

@@ -18,6 +18,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.measurement_units import conversion
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
+from obsynth.plants.signal_names import suggestion
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
 _TIME_OF_DAY = re.compile(
@@ -159,7 +160,7 @@ class LogSignals:
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
-                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing)}",
+                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing, *self._first_of(missing))}",
                 path="data",
             )
         present = [name for name in matches if name is not None]
@@ -170,6 +171,11 @@ class LogSignals:
                 path="data",
             )
         return [header.index(name) for name in present]
+
+    def _first_of(self, missing: Sequence[str]) -> tuple[str, str]:
+        """Return the first of these columns that is for a signal, and the signal; of the time where none is."""
+        signals = dict(zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.one), strict=True))
+        return next(((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER))
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
@@ -249,12 +255,23 @@ def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | No
     return by_column
 
 
-def _advice(header: tuple[str, ...], missing: list[str]) -> str:
+def _advice(header: tuple[str, ...], missing: list[str], column: str, signal: str) -> str:
+    """Return what to do about columns that are missing, such as this one of a signal, or of the time."""
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
+    if TIME_HEADER in missing and (advice := time_advice(header)):
+        return advice
+    meant = next((name for name in header if name.casefold() == column.casefold()), "YOUR_COLUMN")
+    question = suggestion(column, header)
+    return f"{question} Map it: --map {shlex.quote(signal)}={shlex.quote(meant)}.".lstrip()
+
+
+def time_advice(header: Sequence[str]) -> str:
+    """Return how a column that looks like the time is named, as a sentence; empty where none does."""
     time_like = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
     time_like = time_like or next((name for name in header if name.lower() == "t"), None)
-    if TIME_HEADER in missing and time_like is not None:
-        return f"If {time_like!r} is the time: --time-column {time_like!r}, or columns={{'time': {time_like!r}}}."
-    first = next((name for name in missing if name != TIME_HEADER), TIME_HEADER)
-    return f"Map it: --map {shlex.quote(first)}=YOUR_COLUMN."
+    if time_like is None:
+        return ""
+    return (
+        f"If {time_like!r} is the time: --time-column {shlex.quote(time_like)}, or columns={{'time': {time_like!r}}}."
+    )

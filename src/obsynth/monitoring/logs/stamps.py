@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.input_derivatives import derivative_of
@@ -209,11 +209,13 @@ class Stamps:
         return (
             *self.notes,
             *(
-                f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
+                f"{counted(count, 'cell')} of {column!r} without a number: counted as missing, first {text!r} in "
+                f"row {row}."
                 for column, (count, row, text) in self.words.items()
             ),
             *(
-                f"{count} cell(s) of {column!r} count as missing, as {status!r} says so, first {text!r} in row {row}."
+                f"{counted(count, 'cell')} of {column!r} counted as missing, as {status!r} says so, first {text!r} in "
+                f"row {row}."
                 for column, (count, row, text, status) in self.bad.items()
             ),
         )

@@ -14,7 +14,7 @@ from typing import TextIO
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.files.tables import unquoted
 from obsynth.monitoring.logs.signals import LogSignals, column_of, date_place, is_bad, status_places, with_date
 from obsynth.monitoring.logs.stamps import MISSING_TEXTS, Stamps
@@ -211,7 +211,9 @@ def _after_remarks(
     for line in itertools.islice(lines, MOST_REMARKS):
         if _named(line, wanted[:1]) and _named(line, wanted) >= needed:
             if notes is not None:
-                notes.append(f"{len(passed) + 1} line(s) before the header are passed over, first {head.strip()!r}.")
+                notes.append(
+                    f"Passed over {counted(len(passed) + 1, 'line')} before the header, first {head.strip()!r}."
+                )
             return line, lines
         passed.append(line)
     return head, itertools.chain(passed, lines)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SolverError, SpecError
+from obsynth.errors import SolverError, SpecError, counted
 from obsynth.numerics.arguments import checked_value, real_array
 from obsynth.numerics.arrays import FloatArray, all_finite, as_given
 from obsynth.numerics.ranks import SINGULAR_CONDITION
@@ -157,7 +157,7 @@ class DAEObserver(DAESettings):
             require_regular(self, row, row.conditions)
 
     def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        outputs = as_given(y, "y", f"y must be {self.model.ny} number(s) at k = {state.k}.")
+        outputs = as_given(y, "y", f"y must be {counted(self.model.ny, 'number')} at k = {state.k}.")
         # What can be wrong with plain numbers is an infinity: it is told below.
         if not (_is_plain(y, self.model.ny) and (all_finite(outputs) or not np.isinf(outputs).any())):
             outputs = measured_record(np.atleast_2d(outputs), self.model.ny)[0]

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, require_kind, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
@@ -105,7 +105,7 @@ class DAESettings(StepObserver):
         for name in ("lower", "upper"):
             vector = np.asarray(getattr(self, name), dtype=np.float64)
             if vector.shape != (nq,) or np.isnan(vector).any():
-                raise SpecError(f"bounds: {name} must be {nq} number(s).", path="bounds")
+                raise SpecError(f"bounds: {name} must be {counted(nq, 'number')}.", path="bounds")
             object.__setattr__(self, name, read_only(vector))
         for name, low, start, high in zip(
             model.parameter_names, self.lower, self.initial_parameters, self.upper, strict=True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import arguments_checked, shown
 from obsynth.numerics.libraries import imported
 from obsynth.plants.dae import DAEModel
@@ -77,11 +77,12 @@ def from_casadi(
         ("parameters", len(parameters or {}), taken["p"]),
     ):
         if count != wanted:
-            raise SpecError(f"{what} names {count} value(s), but the system has {wanted}.", path=what)
+            raise SpecError(f"{what} names {counted(count, 'value')}, but the system has {wanted}.", path=what)
     if made["ode"] != nx or made["alg"] != nz or not made["y"]:
         raise SpecError(
-            f"The system has {nx} state(s) x and {nz} state(s) z, but {made['ode']} equation(s) ode, {made['alg']} alg "
-            f"and {made['y']} output(s) y: one ode for each x, one alg for each z, and at least one y are needed.",
+            f"The system has {counted(nx, 'state')} x and {counted(nz, 'state')} z, but "
+            f"{counted(made['ode'], 'equation')} ode, {made['alg']} alg and {counted(made['y'], 'output')} y: one ode "
+            "for each x, one alg for each z, and at least one y are needed.",
             path="system",
         )
     if "u" in function.name_in() and function.jac_sparsity(function.index_out("y"), function.index_in("u")).nnz():

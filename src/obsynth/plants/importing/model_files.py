@@ -272,8 +272,8 @@ def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: b
     ]
     if unknown:
         raise SpecError(
-            f"{source} has the field(s) {', '.join(unknown)}, whose meaning is not known here: remove them where the "
-            "matrices do not depend on them.",
+            f"{source} has {'the field' if len(unknown) == 1 else 'the fields'} {', '.join(unknown)}, whose meaning is "
+            "not known here: remove what the matrices do not depend on.",
             path=str(source),
         )
 

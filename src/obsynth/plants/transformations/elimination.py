@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, counted
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
@@ -152,7 +152,7 @@ def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = (
     done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
     if not dropped:
         return done
-    return f"left out {len(dropped)} variable(s) that have no effect ({', '.join(dropped)}); {done}"
+    return f"left out {counted(len(dropped), 'variable')} without an effect ({', '.join(dropped)}); {done}"
 
 
 def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.analysis.existence.recursive import SOURCE, recursive_conditions
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
-from obsynth.errors import ObsynthError
+from obsynth.errors import ObsynthError, counted
 from obsynth.methods.engines.recursive.batch import BATCH_STEPS, batch_residuals, batch_steps
 from obsynth.methods.engines.recursive.consistency import consistency
 from obsynth.methods.engines.recursive.horizon_proof import (
@@ -115,8 +115,8 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
             "rows between its samples",
             float(entry["every"]),
             source="options: sensors",
-            detail=f"its values are delayed by {entry['delay']} row(s); the other rows of this report are about "
-            "samples of every sensor at once",
+            detail=f"its values are delayed by {counted(entry['delay'], 'row')}; the other rows of this report are "
+            "about samples of every sensor at once",
         )
 
 

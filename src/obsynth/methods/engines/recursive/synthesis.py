@@ -12,7 +12,7 @@ from obsynth.analysis.existence.condition import require_all
 from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
 from obsynth.analysis.existence.recursive import detectability_condition
 from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
@@ -203,6 +203,6 @@ def _notes(
         )
     if adaptation.form == "literal" and ranks.directions < observer.plant.ny:
         yield (
-            f"The literal form (18) uses {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "
-            "the innovation form uses all parity directions."
+            f"The literal form (18) uses {counted(ranks.directions, 'residual direction')} of "
+            f"{counted(observer.plant.ny, 'output')}; the innovation form uses all parity directions."
         )
