@@ -101,7 +101,7 @@ def test_what_a_stranger_gets_wrong_is_told_with_what_was_meant(battery, capsys)
     assert "use letters" in nothing
     assert main(["design", "--system", str(DOCS / "examples/battery/spec.yaml"), "--quiet"]) == 0
     assert main(["plot", "--gains", "battery-heater.gains.json", "--data", "log.csv", "--out", "a.png"]) == 2
-    assert "If 'Zeit' is the time: --time-column 'Zeit'" in capsys.readouterr().err
+    assert "If 'Zeit' is the time: --time-column Zeit" in capsys.readouterr().err
 
 
 def test_no_page_names_an_audit_that_no_reader_has():
