@@ -29,7 +29,7 @@ def test_a_matrix_that_cannot_be_read_is_the_only_thing_said_of_its_signals(lett
     others = {"C": {"D": [[1.0], [1.0]], "output_names": ["y", "z"]}, "B": {"input_names": ["u"]}}
     with pytest.raises(SpecError) as found:
         obsynth.DescriptorSystem(**{**PLANT, **others.get(letter, {}), letter: ["x7"]})
-    assert str(found.value) == f"{letter} has no signal named 'x7'."
+    assert str(found.value) == f"{letter} has no signal named 'x7'. There are: x1, x2."
 
 
 def test_mistakes_that_have_nothing_to_do_with_one_another_are_told_together():
