@@ -375,7 +375,8 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;
-    if (known) {
+    /* Without evidence of its own a sample with fewer outputs is decided by the rows before it. */
+    if (known || (deciding && innovation >= 0 && m->taken > MONITOR_SETTLING)) {
         statistic = square(m->white + m->at * CHANNELS) / monitor_levels[0][0];
         for (i = 0; i < MEANS; i++) {
             ratio = square(m->means + i * CHANNELS) * monitor_sizes[0][i] / monitor_levels[0][1 + i];

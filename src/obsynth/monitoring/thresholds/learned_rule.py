@@ -52,7 +52,8 @@ class LearnedState(NamedTuple):
 
 class LearnedRule(Rule):
     """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
-    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.
+    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.  Where the gain follows
+    what is measured, a sample whose outputs say nothing by themselves is decided so, too.
 
     Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
     moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
@@ -119,13 +120,17 @@ class LearnedRule(Rule):
         if values_of_row is None or not (
             complete or (varying and (counts or np.isfinite(values_of_row[self._places]).all()))
         ):
-            return self._followed(self._added(state, None), sample.observation), RuleOutput(math.nan, math.nan)
-        watched = values_of_row[self._places]
-        kept = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
-        state = self._followed(
-            self._added(state, kept, most, evidence), sample.observation, np.isfinite(watched), counts=counts
-        )
-        if not counts:
+            state = self._followed(self._added(state, None), sample.observation)
+        else:
+            watched = values_of_row[self._places]
+            kept = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
+            state = self._followed(
+                self._added(state, kept, most, evidence), sample.observation, np.isfinite(watched), counts=counts
+            )
+        # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
+        # stands is not ended by outputs that are left out.
+        by_rows_before = varying and sample.deciding and state.taken > self.learned.settling
+        if values_of_row is None or not (counts or by_rows_before):
             return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
         with np.errstate(all="ignore"):
