@@ -182,7 +182,7 @@ def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int
     return lags, (a, delayed_b, c, direct)
 
 
-def _stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
+def stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
     """Return the block Toeplitz matrix of a window from inputs to outputs."""
     rows, width = c.shape[0], b.shape[1]
     toeplitz, moved, blocks = np.zeros((rows * (length + 1), width * (length + 1))), b, [d]
@@ -226,9 +226,7 @@ def _decoupling_window(
             f"shortest delays are {_listed(first - shift)} samples.",
             condition="delay",
         )
-    return _Window(
-        window.observed, window.Th, _stacked(a, c, *noise, window.length), window.G, window.Mf, window.length
-    )
+    return _Window(window.observed, window.Th, stacked(a, c, *noise, window.length), window.G, window.Mf, window.length)
 
 
 def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:
@@ -297,7 +295,7 @@ def _tried_window(
     nh, rows = bh.shape[1], [c]
     for _ in range(length):
         rows.append(rows[-1] @ a)
-    th = _stacked(a, c, bh, dh, length)
+    th = stacked(a, c, bh, dh, length)
     inverse = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) if nh else np.zeros((0, len(th)))
     first = np.hstack([bh, np.zeros((n, nh * length))])
     chosen = np.zeros((len(selection), nh * (length + 1)))

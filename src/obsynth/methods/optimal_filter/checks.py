@@ -12,12 +12,11 @@ from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed
 from obsynth.methods.optimal_filter.weights import weights_of
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import unproved
 from obsynth.results.checks import Check, fitting_check, lower_bound_check, upper_bound_check
@@ -37,8 +36,6 @@ from obsynth.verification.plant import plant_information
 
 #: Faults pass by the fault map to this share of its largest entry.
 FAULT_MAP_SHARE = 1e-6
-#: What passes directly to the error is rounding below so many bounds on the rounding of its terms.
-ROUNDED_UNITS = 1e4
 #: A recomputed deviation repeats the claimed one to this share.
 DEVIATION_SHARE = 1e-6
 
@@ -173,8 +170,13 @@ def _options_fit(design: ObserverDesign) -> bool:
         timed
         and options["norm"] in ("hinf", "h2")
         and isinstance(options["exact"], bool)
+        and _within_limit(observer.order, options.get("order_limit"))
         and set(options["decoupled"]) <= set(plant.disturbance_names)
     )
+
+
+def _within_limit(order: int, limit: Any) -> bool:
+    return limit is None or (is_whole(limit) and order <= limit)
 
 
 def _is_stable(reference: Model, plant: DescriptorSystem) -> bool:
@@ -314,14 +316,7 @@ def _bound_row(name: str, claim: str, bound: float | None, stated: float, detail
 
 
 def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) -> Check:
-    (a, b, c, d), direct = channel.middle, channel(Ball)[3]
-    if plant.is_discrete:
-        covariance = discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
-    else:
-        covariance = continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
-        # White noise that passes, by more than rounding, has no mean square.
-        d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
-    deviation = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
+    deviation = channel.deviation(plant.dt)
     # Of zero nothing but rounding may be left.
     unit = stated if stated else channel.size * ZERO_GAIN / DEVIATION_SHARE
     return upper_bound_check(

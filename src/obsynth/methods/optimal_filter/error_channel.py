@@ -12,9 +12,13 @@ from scipy.linalg import block_diag
 from obsynth.methods.optimal_filter.weights import Weights
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed
 from obsynth.verification.error_system import ErrorModel
+
+#: What passes directly to the error is rounding below so many bounds on the rounding of its terms.
+ROUNDED_UNITS = 1e4
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,17 @@ class ErrorChannel:
         """The matrices in double precision."""
         a, b, c, d = self(Ball)
         return a.midpoint, b.midpoint, c.midpoint, d.midpoint
+
+    def deviation(self, dt: float) -> float:
+        """Return the root mean square of the error for white noise of unit intensity; infinite where this passes."""
+        (a, b, c, d), direct = self.middle, self(Ball)[3]
+        if dt > 0.0:
+            covariance = discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
+        else:
+            covariance = continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
+            # White noise that passes, by more than rounding, has no mean square.
+            d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
+        return float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
 
     def __call__(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         """Return the matrices with what forming them may have cost."""

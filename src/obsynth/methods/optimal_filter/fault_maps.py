@@ -211,6 +211,20 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     """Return the problem of estimation of a fault map, in units in which the plant is near one."""
     plant = fault_map.driven(plant)
     own, units = _units_of(plant)
+    channels, each = channels_of(plant, fault_map)
+    models = fault_map.setting.models
+    if not models:
+        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
+        weights = (own.faults / units.error)[:, None]
+        return replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
+    a, b, c, d = reduce(in_series, models)
+    scaled = (a, b * each, c / units.error, d * each / units.error)
+    return estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
+
+
+def channels_of(plant: DescriptorSystem, fault_map: FaultMap) -> tuple[Channels, FloatArray]:
+    """Return a plant in units in which it is near one, and the unit of each fault."""
+    own, units = _units_of(plant)
     left, shown, states = own.equations[:, None], own.outputs[:, None], own.states
     each = own.faults if fault_map.exact else np.full(plant.nf, units.error)
     noise = units.noise if fault_map.exact else units.error
@@ -228,14 +242,12 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
         shown * plant.Dw * noise,
         plant.dt,
     )
-    models = fault_map.setting.models
-    if not models:
-        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
-        weights = (own.faults / units.error)[:, None]
-        return replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
-    a, b, c, d = reduce(in_series, models)
-    scaled = (a, b * each, c / units.error, d * each / units.error)
-    return estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
+    return channels, each
+
+
+def unit_of_errors(plant: DescriptorSystem) -> float:
+    """Return the unit of the errors, of what is estimated, beside the channels of a plant."""
+    return _units_of(plant)[1].error
 
 
 def unit_of_gains(plant: DescriptorSystem, fault_map: FaultMap) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, plain
 from obsynth.methods.optimal_filter.delays import is_auto
-from obsynth.numerics.arguments import OpenUnitInterval, WrittenAs
+from obsynth.numerics.arguments import Count, OpenUnitInterval, WrittenAs
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known
@@ -55,6 +55,10 @@ class OptimalFilterMethod(Method):
         number or a stable model of one input and one output, such as ``control.tf([1, 1], [1, 0.1])``, or one for
         all of a group.  Weights of errors pass at once and have strictly stable zeros.  All claims are then of the
         weighted problem.
+    order_limit : int, optional
+        Most states of the filter, for small processors.  Where the filter of least gain has more, one of that order
+        with the same fault map and decoupling is searched; its own gain is claimed beside ``least``, which is of
+        filters of any order.  It is a local minimum: no claim says that it is the best of its order.
     steady_error_limit : float, optional
         Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
         design beyond it is refused.
@@ -74,8 +78,11 @@ class OptimalFilterMethod(Method):
     PreconditionError
         No causal filter has this fault map: the delay is too short, the faults have an unstable zero, or disturbances
         cannot be decoupled.
+    InfeasibleError
+        No filter of ``order_limit`` states has this fault map; the message has the least order.
     SolverError
-        The Riccati equations have no usable solution, or no level near the gain is proved.
+        The Riccati equations have no usable solution, no level near the gain is proved, or no stable filter of
+        ``order_limit`` states was found.
     VerificationError
         The shipped realisation fails a check.
 
@@ -123,6 +130,7 @@ class OptimalFilterMethod(Method):
     exact: bool = True
     decoupled: Annotated[Any, WrittenAs("texts")] = None
     weights: Annotated[Any, WrittenAs("weights")] = None
+    order_limit: Count | None = None
     steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:

@@ -27,6 +27,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
 from obsynth.methods.optimal_filter.lasting_modes import ADDED_DRIVES, with_lasting_modes_driven
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
+from obsynth.methods.optimal_filter.reduced_order import filters_of_order
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
@@ -137,9 +138,13 @@ def _made(
     ``searched``: the plant that the filter was searched for, where noise was added.
     """
     fault_map = chosen.fault_map
-    chosen, follower, observer = _with_enough_noise(plant if searched is None else searched, chosen, asked.norm)
+    own = plant if searched is None else searched
+    chosen, follower, observer = _with_enough_noise(own, chosen, asked.norm)
+    full = observer.order
+    if asked.order_limit is not None and full > asked.order_limit:
+        chosen, follower, observer = _of_low_order(own, chosen, asked.order_limit, full, asked.norm)
     if searched is not None:
-        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, observer, follower))
+        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, follower, observer, asked.norm))
     matrices, claims = certified(plant, chosen, observer, follower, asked.norm)
     matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
@@ -152,6 +157,7 @@ def _made(
         "exact": fault_map.exact,
         "decoupled": [*plant.disturbance_names],
         "weights": plain_weights(asked.weights, plant),
+        "order_limit": asked.order_limit,
         "steady_error_limit": asked.steady_error_limit,
     }
     solver = {
@@ -161,19 +167,60 @@ def _made(
     }
     gains = {"T": follower.T, "T0": follower.T0}
     notes = tuple(_notes(plant, curve, chosen, asked, claims))
+    notes += (
+        ()
+        if chosen.least is None or asked.order_limit is None
+        else (_reduced_note(chosen, observer.order, full, claims),)
+    )
     notes += () if searched is None else (LASTING_NOTE,)
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
 
 
-def _recomputed_gain(plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: Followed) -> float:
-    """Return the gain of a filter on another plant than it was searched for."""
-    model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
+def _recomputed_gain(
+    plant: DescriptorSystem, chosen: Designed, follower: Followed, observer: LinearObserver, norm: str
+) -> float:
+    """Return the norm of a filter on a plant, which need not be the one that it was searched for."""
+    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
     fault_map = chosen.fault_map
     channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
+    if norm == "h2":
+        return channel.deviation(plant.dt)
     a, b, c, d = channel.middle
     if not plant.is_discrete:
         a, b, c, d = cayley(a, b, c, d, chosen.problem.alpha)
     return float(hinf_norm(a, b, c, d).upper)
+
+
+def _of_low_order(
+    plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str
+) -> tuple[Designed, Followed, LinearObserver]:
+    """Return the first filter of low order whose realisation keeps the fault map, with its own gain."""
+    for filter_ in filters_of_order(plant, chosen, limit, full, norm):
+        realised = _of_at_most(plant, filter_, limit)
+        gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
+        if realised is not None and math.isfinite(gain):
+            return filter_._replace(gain=gain), *realised
+    raise SolverError(
+        f"The filters of at most {limit} states that were found keep the fault map by rounding only: the result is "
+        f"inconclusive. Give a larger order_limit: the filter of least gain has {full} states."
+    )
+
+
+def _of_at_most(plant: DescriptorSystem, chosen: Designed, limit: int) -> tuple[Followed, LinearObserver] | None:
+    """Return a filter's realisation; ``None`` where it has more states, or no longer the fault map."""
+    try:
+        follower, observer, missed = _realised(plant, chosen)
+    except SolverError:
+        return None
+    return (follower, observer) if observer.order <= limit and missed <= EXACT_SHARE else None
+
+
+def _reduced_note(chosen: Designed, order: int, full: int, claims: Mapping[str, float]) -> str:
+    own = claims.get("gain", claims.get("deviation", 0.0))
+    return (
+        f"The filter of least gain has {full} states, and {chosen.least:.6g}; this one has {order} and {own:.6g}, a "
+        "local minimum for its order. The least is that of filters of any order."
+    )
 
 
 def _with_enough_noise(
@@ -185,23 +232,32 @@ def _with_enough_noise(
     """
     more = [noise for noise in ADDED_NOISES if noise > chosen.added_noise and chosen.least is None]
     while True:
-        problem, fault_map = chosen.problem, chosen.fault_map
         try:
-            outputs = PlantUnits.of(plant).rounded().outputs
-            ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
-            follower = followed(plant, ways, problem.window + problem.shift)
-            rows = len(follower.C)
-            names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-            observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
-            model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
-            exact = fault_map.exact and bool(more)
-            if not exact or fault_map_missed(model, fault_map)[0] <= EXACT_SHARE:
+            follower, observer, missed = _realised(plant, chosen)
+            exact = chosen.fault_map.exact and bool(more)
+            if not exact or missed <= EXACT_SHARE:
                 return chosen, follower, observer
         except SolverError:
             if not more:
                 raise
-        chosen = designed(plant, fault_map, norm, more)
+        chosen = designed(plant, chosen.fault_map, norm, more)
         more = [noise for noise in more[1:] if noise > chosen.added_noise]
+
+
+def _realised(plant: DescriptorSystem, chosen: Designed) -> tuple[Followed, LinearObserver, float]:
+    """Return a filter's realisation, and by which share it misses its fault map."""
+    problem, fault_map = chosen.problem, chosen.fault_map
+    outputs = PlantUnits.of(plant).rounded().outputs
+    ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
+    # One of few states may follow the plant by states that y does not reach.
+    ways += [chosen.filter] if chosen.least is not None else []
+    follower = followed(plant, ways, problem.window + problem.shift)
+    rows = len(follower.C)
+    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
+    observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
+    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
+    missed = fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
+    return follower, observer, missed
 
 
 class _Row(NamedTuple):
@@ -307,7 +363,9 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
     of = of if fault_map.weights is None else f"{of}, of the weighted problem"
     if asked.norm == "h2":
         of = of.replace("causal filters, linear or not,", "causal linear filters")
-        text = f"Least deviation {of}: {claims['deviation']:.8g}, reached by this filter."
+        own, least = claims["deviation"], claims["least_deviation"]
+        reached = "reached by this filter" if own == least else f"this filter: {own:.8g}"
+        text = f"Least deviation {of}: {least:.8g}, {reached}."
     elif chosen.is_nothing:
         text = f"Least gain {of}: 0; this filter: 0 but for rounding."
     else:

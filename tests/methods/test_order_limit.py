@@ -1,0 +1,157 @@
+"""Optimal filters of few states: the fault map is kept, the order is the one asked for, and its gain is near the best.
+
+The truths are those of another way: filters of finite response, by least squares and by a convex programme.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import obsynth
+
+#: A random walk on y2, and on y1 with the fault: what is late by three samples and remembers three is a sum of four
+#: samples of y2 with weights whose sum is one.
+WALK = obsynth.DescriptorSystem(
+    A=[[1.0]], Bf=[[0]], Bw=[[1, 0]], C=[[1], [1]], Df=[[1], [0]], Dw=[[0, 0], [0, 1]], dt=1.0
+)
+STEPS = np.array([[float(j < 3 - i) for j in range(3)] for i in range(4)])
+TWO_SENSORS = obsynth.DescriptorSystem(
+    A=[[-1.0]], Bf=[[0]], Bw=[[1, 0]], C=[[1], [1]], Df=[[1], [0]], Dw=[[0, 0], [0, 1]], dt=0.0
+)
+
+
+def plant(seed: int, *, n: int = 5, nd: int = 0) -> obsynth.DescriptorSystem:
+    """Return a plant of two faults, an input, and noise on every state and output."""
+    rng = np.random.default_rng([4701, seed])
+    a = rng.normal(size=(n, n))
+    a *= (1.1 if seed % 2 else 0.85) / np.max(np.abs(np.linalg.eigvals(a)))
+    return obsynth.DescriptorSystem(
+        A=a, B=rng.normal(size=(n, 1)), C=rng.normal(size=(4, n)), Bf=rng.normal(size=(n, 2)),
+        Bd=rng.normal(size=(n, nd)), Bw=np.hstack([0.3 * rng.normal(size=(n, n)), np.zeros((n, 4))]),
+        Dw=np.hstack([np.zeros((4, n)), 0.2 * np.eye(4)]), dt=1.0,
+    )  # fmt: skip
+
+
+def test_the_mean_square_is_that_of_least_squares_over_four_samples() -> None:
+    design = obsynth.optimal_filter(WALK, delay=3, norm="h2", order_limit=3)
+    assert design.report.passed
+    assert design.observer.order == 3
+    # Noise of y2, and the steps of the walk between its samples and the oldest one.
+    squares = STEPS @ STEPS.T + np.eye(4)
+    weights = np.linalg.solve(squares, np.ones(4))
+    weights /= weights.sum()
+    assert design.gain == pytest.approx(np.sqrt(weights @ squares @ weights), rel=1e-8)
+    full = obsynth.optimal_filter(WALK, delay=3, norm="h2")
+    assert full.observer.order == 4
+    assert design.least == full.gain < design.gain
+    assert "Least deviation over all causal linear filters" in design.notes[0]
+    assert "this filter: 0.78679579" in design.notes[0]
+
+
+def test_the_gain_is_that_of_a_convex_programme_over_four_samples() -> None:
+    """One sample of y2, three samples old, has gain 1, which no filter of any order beats."""
+    design = obsynth.optimal_filter(WALK, delay=3, order_limit=3)
+    assert design.report.passed
+    assert design.observer.order == 3
+    assert 1.0 - 1e-9 <= design.least <= 1.0 <= design.gain <= 1.002
+
+
+@pytest.mark.parametrize(("seed", "norm"), [(0, "hinf"), pytest.param(1, "hinf", marks=pytest.mark.long), (1, "h2")])
+def test_a_filter_of_fewer_states_keeps_fault_map_and_decoupling(seed: int, norm: str, tmp_path) -> None:
+    case = plant(seed, nd=1)
+    full = obsynth.optimal_filter(case, delay=1, decoupled="d1", norm=norm)
+    limit = full.observer.order - 1
+    design = obsynth.optimal_filter(case, delay=1, decoupled="d1", norm=norm, order_limit=limit)
+    assert {"decoupling", "fault map"} <= {check.name for check in design.report.checks if check.passed}
+    assert design.report.passed
+    assert design.observer.order <= limit
+    assert design.least <= full.gain * (1.0 + 1e-9)
+    assert full.least * (1.0 - 1e-6) <= design.gain <= 1.1 * full.gain
+    assert "a local minimum for its order" in design.notes[-1]
+    again = obsynth.load(design.save(tmp_path / "few.gains.json"))
+    assert obsynth.verify(again).passed
+    assert again.options["order_limit"] == limit
+    # Faults pass a sample late, whatever u and d do.
+    rng = np.random.default_rng(seed)
+    f, u, d, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), rng.normal(size=(60, 1)), np.zeros(case.nx)
+    y = np.zeros((60, 4))
+    for k in range(60):
+        y[k] = case.C @ x
+        x = case.A @ x + case.B @ u[k] + case.Bf @ f[k] + case.Bd @ d[k]
+    estimates = design.observer.run(y, u).faults
+    size = float(np.max(np.abs(y)))
+    np.testing.assert_allclose(estimates[1:], f[:-1], atol=1e-8 * max(size, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("case", "options", "limit", "room"),
+    [
+        (TWO_SENSORS, {"reference": {"bandwidth": 2.0}}, 1, 1.1),
+        (TWO_SENSORS, {"reference": {"bandwidth": 2.0}, "weights": {"errors": 3.0, "inputs": {"w2": 0.5}}}, 1, 1.1),
+        (plant(2, n=3), {"reference": {"bandwidth": 1.0}, "exact": False}, 4, 1.2),
+    ],
+    ids=["continuous", "weights", "matching"],
+)
+def test_other_problems_have_filters_of_few_states(case, options, limit, room) -> None:
+    full = obsynth.optimal_filter(case, **options)
+    assert full.observer.order > limit
+    design = obsynth.optimal_filter(case, **options, order_limit=limit)
+    assert design.report.passed
+    assert design.observer.order <= limit
+    assert full.least * (1.0 - 1e-6) <= design.gain <= room * full.gain
+
+
+def test_the_mean_square_of_two_states_in_continuous_time_has_its_closed_form() -> None:
+    """4 / (s + 2)^2 of y1 and (p (s + 1) - 4) / (s + 2)^2 of y2 see no state: (6 p^2 - 8 p + 16) / 32, p = 2/3."""
+    options = {"reference": {"bandwidth": 2.0, "order": 2}, "norm": "h2"}
+    design = obsynth.optimal_filter(TWO_SENSORS, **options, order_limit=2)
+    assert design.report.passed
+    assert design.observer.order == 2
+    assert design.gain == pytest.approx((5 / 12) ** 0.5, rel=1e-8)
+
+
+def test_a_filter_that_is_small_enough_is_left_as_it_is() -> None:
+    full = obsynth.optimal_filter(WALK, delay=1)
+    limited = obsynth.optimal_filter(WALK, delay=1, order_limit=full.observer.order)
+    assert (limited.gain, limited.least, limited.observer.order) == (full.gain, full.least, full.observer.order)
+    assert limited.notes == full.notes
+
+
+def test_too_few_states_are_refused_with_the_order_that_works() -> None:
+    case = plant(0, nd=1)
+    with pytest.raises(obsynth.InfeasibleError, match=r"at least \d .*order_limit=\d+\.$") as refusal:
+        obsynth.optimal_filter(case, delay=1, decoupled="d1", order_limit=1)
+    assert refusal.value.necessary
+    works = int(str(refusal.value).rpartition("=")[2].rstrip("."))
+    assert works >= refusal.value.lower_bound > 1
+    design = obsynth.optimal_filter(case, delay=1, decoupled="d1", order_limit=works)
+    assert design.report.passed
+    assert design.observer.order <= works
+    with pytest.raises(obsynth.SpecError, match="order_limit"):
+        obsynth.optimal_filter(WALK, order_limit=0)
+
+
+def test_three_samples_of_delay_need_three_states() -> None:
+    """y1 is read three samples late: no filter of two states has it."""
+    with pytest.raises(obsynth.InfeasibleError, match=r"at least 3 .*order_limit=3"):
+        obsynth.optimal_filter(WALK, delay=3, order_limit=2)
+
+
+def test_a_design_above_its_own_limit_fails() -> None:
+    design = obsynth.optimal_filter(WALK, delay=3, norm="h2", order_limit=3)
+    for limit, passed in ((3, True), (2, False), ("few", False)):
+        other = design.replace(options={**design.options, "order_limit": limit})
+        assert obsynth.verify(other).passed is passed
+
+
+def test_modes_that_y_does_not_reach_are_states_all_the_same() -> None:
+    """A is nilpotent: rounding in rows of the filter that are zero left no T, and the search gave up."""
+    case = obsynth.DescriptorSystem(
+        A=np.diag([0.5, 0.0, 0.0]) + np.eye(3, k=-1), Bf=[[1, 0], [0, 0], [0, 1]], Bw=np.zeros((3, 2)),
+        C=[[0, 1, 0], [0, 0, 1]], Dw=np.diag([1.0, 2.0]), dt=1.0,
+    )  # fmt: skip
+    design = obsynth.optimal_filter(case, delay=[2, 1], order_limit=3)
+    assert design.report.passed
+    assert design.observer.order == 3
+    assert design.least == pytest.approx(design.gain, rel=1e-6)
