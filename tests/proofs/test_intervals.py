@@ -55,3 +55,27 @@ def test_single_operations_hold_their_exact_results() -> None:
 def test_what_is_not_bounded_or_jumps_is_refused(text: str, told: str) -> None:
     with pytest.raises(PreconditionError, match=told):
         range_over(parse_expression(text), {"x": (-1.0, 1.0)})
+
+
+@pytest.mark.parametrize(
+    ("text", "box", "ends"),
+    [
+        ("sqrt(x + 1)", {"x": (-1.0, 3.0)}, (0.0, 2.0)),
+        ("sqrt(x * y)", {"x": (0.0, 1.0), "y": (0.0, 4.0)}, (0.0, 2.0)),
+        ("sqrt(x / y)", {"x": (0.0, 4.0), "y": (1.0, 2.0)}, (0.0, 2.0)),
+        ("sqrt(sqrt(x))", {"x": (0.0, 16.0)}, (0.0, 2.0)),
+        ("sqrt(exp(x))", {"x": (-1000.0, 0.0)}, (0.0, 1.0)),
+    ],
+)
+def test_the_edge_of_a_domain_belongs_to_it(
+    text: str, box: dict[str, tuple[float, float]], ends: tuple[float, float]
+) -> None:
+    found = range_over(parse_expression(text), box)
+    assert found.low <= ends[0] <= found.attained_low + 1e-12
+    assert ends[1] <= found.high <= ends[1] * (1.0 + 1e-12)
+
+
+def test_a_product_that_is_rounded_to_zero_is_not_zero() -> None:
+    tiny = Interval(-1e-200, 1e-200) * Interval(1e-200, 1e-200)
+    assert tiny.low < 0.0 < tiny.high
+    assert (Interval(0.0, 1.0) * Interval(0.5, 1.0)).low == 0.0

@@ -26,8 +26,8 @@ def nonlinear_region(
     model: DAEModel,
     region: Mapping[str, Any],
     *,
-    sample_time: float,
-    noise: Mapping[str, float],
+    sample_time: float | None = None,
+    noise: Mapping[str, float] | None = None,
     goal: str = "gain",
     multiplier: str = "vertices",
     faults: Sequence[str] | None = None,
@@ -45,7 +45,7 @@ def nonlinear_region(
     sample_time : float, seconds
         Of the outputs' noise.
     noise : mapping
-        Deviations of outputs, and how faults drift.
+        Deviations of outputs, and how faults drift.  A goal of decay needs neither.
     goal : {"gain", "power", "decay"}, optional
         What is made small.
     multiplier : {"vertices", "full", "diagonal"}, optional
@@ -78,7 +78,9 @@ def nonlinear_region(
     'optimal'
     """
     chosen(multiplier, "multiplier", ("vertices", "full", "diagonal"))
-    step = real_number(sample_time, "sample_time", "the seconds between samples", above=0.0)
+    # A decay alone needs no noise, and no samples of it.
+    undriven = goal == "decay" and noise is None
+    step = 1.0 if undriven else real_number(sample_time, "sample_time", "the seconds between samples", above=0.0)
     chosen_faults = tuple(model.parameter_names if faults is None else faults)
     conditions = region_conditions(model, region, chosen_faults)
     require_all(conditions)
@@ -87,8 +89,8 @@ def nonlinear_region(
     slopes = place.slopes()
     bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
     W, Wy, V = directions(terms, slopes)
-    B, D = drive_of(terms, noise, step)
     nd, n = terms.differential, len(terms.names)
+    B, D = (np.zeros((n, 0)), np.zeros((len(terms.output_names), 0))) if undriven else drive_of(terms, noise, step)
     shared: dict[str, Any] = {
         "B": B,
         "D": D,

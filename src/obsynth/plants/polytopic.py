@@ -343,7 +343,10 @@ def _descriptor(arguments: dict[str, Any]) -> DescriptorSystem:
 
 
 def _form(text: str, place: str, constants: Mapping[str, float], names: tuple[str, ...]) -> LinearForm:
-    expression = parse_expression(text)
+    try:
+        expression = parse_expression(text)
+    except SpecError as error:
+        raise SpecError(f"{place}: {error}", path=f"plant.{place}") from None
     unknown = sorted(expression.names - set(names) - set(constants))
     if unknown:
         raise SpecError(
@@ -371,7 +374,14 @@ def _vertex(
         matrix = np.array(getattr(base, name))
         for row, column, form in entries:
             total = form.constant + sum((f * Fraction(values[text]) for text, f in form.parts.items()), Fraction(0))
-            matrix[row, column] = float(total)
+            try:
+                matrix[row, column] = float(total)
+            except OverflowError:
+                where = ", ".join(f"{text} = {values[text]:.6g}" for text in form.parts)
+                raise PreconditionError(
+                    f"{name}[{row + 1},{column + 1}] overflows at {where}. Give a smaller range, or other units.",
+                    condition="boundedness",
+                ) from None
         changed[name] = matrix
     return base.replace(**changed) if changed else base
 

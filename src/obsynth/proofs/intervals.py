@@ -66,7 +66,12 @@ class Interval:
         addend = Interval.of(other)
         if addend.low == addend.high == 0.0:
             return self
-        return Interval.outward(self.low + addend.low, self.high + addend.high)
+        low, high = self.low + addend.low, self.high + addend.high
+        outside = Interval.outward(low, high)
+        return Interval(
+            low if _is_exact_sum(self.low, addend.low, low) else outside.low,
+            high if _is_exact_sum(self.high, addend.high, high) else outside.high,
+        )
 
     def __neg__(self) -> Interval:
         """Return all negatives; exact."""
@@ -82,16 +87,19 @@ class Interval:
         for interval, constant in ((self, factor), (factor, self)):
             if constant.is_point and constant.low in (1.0, -1.0):
                 return interval if constant.low > 0.0 else -interval
-        products = [x * y for x in (self.low, self.high) for y in (factor.low, factor.high)]
-        return Interval.outward(min(products), max(products))
+        pairs = [(x, y) for x in (self.low, self.high) for y in (factor.low, factor.high)]
+        # A product with zero is exact; one of small numbers may be rounded to zero.
+        products = [Interval(0.0, 0.0) if x == 0.0 or y == 0.0 else Interval.outward(x * y, x * y) for x, y in pairs]
+        return Interval(min(product.low for product in products), max(product.high for product in products))
 
     def __truediv__(self, other: Any) -> Interval:
         """Return all quotients; refused where the divisor can be zero."""
         divisor = Interval.of(other)
         if divisor.low <= 0.0 <= divisor.high:
             raise _unbounded(f"a divisor lies between {divisor.low:.4g} and {divisor.high:.4g} and can be zero")
-        quotients = [x / y for x in (self.low, self.high) for y in (divisor.low, divisor.high)]
-        return Interval.outward(min(quotients), max(quotients))
+        pairs = [(x, y) for x in (self.low, self.high) for y in (divisor.low, divisor.high)]
+        quotients = [Interval(0.0, 0.0) if x == 0.0 else Interval.outward(x / y, x / y) for x, y in pairs]
+        return Interval(min(quotient.low for quotient in quotients), max(quotient.high for quotient in quotients))
 
     def __pow__(self, other: Any) -> Interval:
         """Return all powers."""
@@ -213,7 +221,7 @@ def interval_of(expression: Expression, box: Mapping[str, tuple[float, float]]) 
     try:
         return Interval.of(expression.translated(values, interval_operation))
     except OverflowError:
-        raise _unbounded("it overflows") from None
+        raise _unbounded(f"{expression.text!r} overflows") from None
     except PreconditionError as error:
         raise PreconditionError(f"{expression.text!r}: {error}", condition="boundedness") from None
 
@@ -266,6 +274,12 @@ def _least(
     return count, low, best
 
 
+def _is_exact_sum(x: float, y: float, total: float) -> bool:
+    """Whether a floating-point sum of two numbers is their sum (Knuth's two-sum has no rest)."""
+    part = total - x
+    return (x - (total - part)) + (y - part) == 0.0
+
+
 def _unbounded(text: str) -> PreconditionError:
     return PreconditionError(f"{text} on the region. Give a smaller range.", condition="boundedness")
 
@@ -276,6 +290,17 @@ def _increasing(function: Callable[[float], float]) -> Callable[[Interval], Inte
             return Interval.outward(function(x.low), function(x.high), FUNCTION_ROUNDINGS)
         except ValueError:
             raise _unbounded(f"the argument of {function.__name__} lies between {x.low:.4g} and {x.high:.4g}") from None
+
+    return taken
+
+
+def _not_negative(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
+    """Return an increasing function without negative values: no rounding makes it one."""
+    increasing = _increasing(function)
+
+    def taken(x: Interval) -> Interval:
+        interval = increasing(x)
+        return Interval(max(interval.low, 0.0), interval.high)
 
     return taken
 
@@ -343,10 +368,10 @@ _OF_ONE: dict[Callable[..., Any], Callable[[Interval], Interval]] = {
     np.sinh: _increasing(math.sinh),
     np.cosh: _cosh,
     np.tanh: _increasing(math.tanh),
-    np.exp: _increasing(math.exp),
+    np.exp: _not_negative(math.exp),
     np.log: _increasing(math.log),
     np.log10: _increasing(math.log10),
-    np.sqrt: _increasing(math.sqrt),
+    np.sqrt: _not_negative(math.sqrt),
     np.abs: _absolute,
     np.sign: _constant(np.sign, "sign"),
     np.floor: _constant(np.floor, "floor"),

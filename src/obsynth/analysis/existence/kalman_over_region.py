@@ -8,7 +8,6 @@ them is no condition of existence, but sought.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -81,10 +80,10 @@ def _in_order(plant: PolytopicSystem) -> Iterator[Condition]:
         "" if rank == plant.nx else "with constant gains every direction of an unknown input is left out at once",
         of_the_method=not plant.is_constant("Bd"),
     )
-    for where, point in frozen_points(plant):
-        for condition in kalman_conditions(point):
+    for point in frozen_points(plant):
+        for condition in kalman_conditions(point.plant):
             if not condition.holds:
-                yield replace(condition, name=f"{condition.name} at {where}")
+                yield point.failing(condition)
                 return
     yield Condition(
         "filter at every vertex",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,13 @@ from obsynth.analysis.existence.condition import Condition, up_to_failure
 from obsynth.analysis.existence.recursive import described_mode
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.errors import PreconditionError, counted
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.operating_region import OperatingRegion, Slope
 from obsynth.plants.signal_names import leading_names
-from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
+from obsynth.plants.transformations.nonlinear_terms import ARGUMENT, NonlinearTerms, nonlinear_terms
 
 #: Slopes over whose corners a proof is made one by one: 2 ** 12 = 4096.
 MOST_SLOPES = 12
@@ -54,7 +58,8 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         )  # fmt: skip
         return
     try:
-        slopes = OperatingRegion.of(terms, region).slopes()
+        place = OperatingRegion.of(terms, region)
+        slopes = place.slopes()
     except PreconditionError as error:
         yield Condition(
             "bounded slopes", "every nonlinearity has a bounded slope over the region", False, 0.0, 1.0, _SOURCE,
@@ -75,19 +80,69 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         "or linearise what hardly bends",
     )  # fmt: skip
     if len(slopes) <= MOST_SLOPES:
-        yield _detectable_in_the_middle(terms, slopes)
+        bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
+        if terms.differential < len(terms.names):
+            yield _algebraic_states(terms, slopes, bounds)
+        middle = bounds.mean(axis=1)
+        yield _detectable(terms, slopes, middle, "in the middle", "with slopes in the middle of their bounds")
+        for k in np.flatnonzero((bounds[:, 0] < 0.0) & (bounds[:, 1] > 0.0) & (middle != 0.0)):
+            at_zero = np.where(np.arange(len(middle)) == k, 0.0, middle)
+            condition = _detectable(terms, slopes, at_zero, "where a slope is zero", "where the slope of one is zero")
+            if not condition.holds:
+                text = terms.nonlinearities[slopes[k].nonlinearity].expression.text
+                which = place.in_signals(
+                    f"This is where the slope of {text!r} by {ARGUMENT}{slopes[k].argument} is zero."
+                )
+                # Slopes of several nonlinearities need not take these values together.
+                yield replace(condition, of_the_method=True, detail=f"{condition.detail}. {which}")
+                return
 
 
-def _detectable_in_the_middle(terms: NonlinearTerms, slopes: Sequence[Slope]) -> Condition:
-    """Return whether every mode that does not decay is seen where slopes are in the middle of their bounds.
+def _at_slopes(terms: NonlinearTerms, slopes: Sequence[Slope], values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return A and C at values of the slopes."""
+    A, C = np.array(terms.A), np.array(terms.C)
+    for each, value in zip(slopes, values, strict=True):
+        turned = value * terms.state_parts[each.argument]
+        A += np.outer(terms.W[:, each.nonlinearity], turned)
+        C += np.outer(terms.Wy[:, each.nonlinearity], turned)
+    return A, C
+
+
+def _algebraic_states(terms: NonlinearTerms, slopes: Sequence[Slope], bounds: FloatArray) -> Condition:
+    """Return whether the determinant of the algebraic equations has one sign at all corners where it is not zero.
+
+    Where it has both, it is zero between them, and no inequality over the hull of the slopes has a solution.
+    """
+    nd, names = terms.differential, terms.names[terms.differential :]
+    signs = set[float]()
+    for corner in itertools.product(*bounds.tolist()):
+        A22 = _at_slopes(terms, slopes, np.array(corner))[0][nd:, nd:]
+        if decide_rank(A22, expected=len(A22)).full:
+            signs.add(float(np.linalg.slogdet(A22)[0]))
+    return Condition(
+        "index 1 over the region",
+        "the algebraic equations determine the algebraic states at all slopes between their bounds",
+        len(signs) < 2,
+        float(len(signs)),
+        1.0,
+        _SOURCE,
+        f"between two corners the equations no longer determine {', '.join(names)}: give a smaller region, on one side "
+        "of where the equations turn"
+        if len(signs) > 1
+        else "",
+        signals=tuple(names) if len(signs) > 1 else (),
+        of_the_method=True,
+    )
+
+
+def _detectable(
+    terms: NonlinearTerms, slopes: Sequence[Slope], values: FloatArray, where: str, claim: str
+) -> Condition:
+    """Return whether every mode that does not decay is seen at values of the slopes.
 
     Where one is not, no gain makes the errors decay there, so that there is no certificate over the region.
     """
-    A, C = np.array(terms.A), np.array(terms.C)
-    for each in slopes:
-        turned = 0.5 * (each.low + each.high) * terms.state_parts[each.argument]
-        A += np.outer(terms.W[:, each.nonlinearity], turned)
-        C += np.outer(terms.Wy[:, each.nonlinearity], turned)
+    A, C = _at_slopes(terms, slopes, values)
     E = np.diag([float(place < terms.differential) for place in range(len(A))])
     plant = DescriptorSystem(E, A, C=C, dt=0.0, state_names=terms.names, output_names=terms.output_names)
     lost = Evaluator(plant).hidden_modes().outside
@@ -97,8 +152,8 @@ def _detectable_in_the_middle(terms: NonlinearTerms, slopes: Sequence[Slope]) ->
         null = np.linalg.svd(np.vstack([A - mode * E, C.astype(complex)]))[2][-1]
         names = leading_names(np.abs(null), terms.names)
     return Condition(
-        "detectable in the middle",
-        "with slopes in the middle of their bounds, modes that no output shows decay",
+        f"detectable {where}",
+        f"{claim}, modes that no output shows decay",
         not lost,
         float(len(lost)),
         0.0,

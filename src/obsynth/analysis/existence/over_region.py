@@ -9,7 +9,7 @@ directions, ``Bf(mu) = Bf0 Delta(mu)`` with Delta nonsingular on the hull, and r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,13 +20,15 @@ from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.polytopic import SCHEDULED_MATRICES, PolytopicSystem
 from obsynth.proofs.vertex_inequalities import prove_nonsingular
 
 #: What is kept of ``1 / |Delta^-1|`` in its proof, largest share first.
 EFFECTIVENESS_SHARES = (1.0 - 1e-9, 0.99, 0.5, 0.1)
 #: Roundings of an entry by a least-squares solution, beside the largest entry, for each row.
 LEAST_SQUARES_ROUNDINGS = 16.0
+#: Points where an entry vanishes that are looked at: each costs as much as a vertex.
+MOST_VANISHING = 16
 _SOURCE = "over the region: Wang 2015 with constant T, N"
 #: exp(dt A(mu)) has no vertices: what helps a filter of samples where the plant is continuous.
 _CONTINUOUS = (
@@ -83,19 +85,100 @@ def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condi
     )
 
 
-def frozen_points(plant: PolytopicSystem) -> Iterator[tuple[str, DescriptorSystem]]:
-    """Yield name and plant at every vertex, then in the middle of the region: a parameter may rest anywhere."""
-    for place, vertex in enumerate(plant.vertices):
-        yield plant.scheduling.vertex_name(place), vertex
-    scheduling = plant.scheduling
-    if plant.count > 1:
-        middle = (
-            np.full(plant.count, 1.0 / plant.count)
-            if scheduling.gives_weights
-            else 0.5 * (scheduling.low + scheduling.high)
+@dataclass(frozen=True, eq=False)
+class FrozenPoint:
+    """The plant where the parameters rest: ``attained`` unless no values of them give it, as at a corner of a hull."""
+
+    where: str
+    plant: DescriptorSystem
+    attained: bool = True
+
+    def failing(self, condition: Condition) -> Condition:
+        """Return a condition that fails here, with the place in its name."""
+        where = replace(condition, name=f"{condition.name} at {self.where}")
+        if self.attained:
+            return where
+        return replace(
+            where,
+            of_the_method=True,
+            detail=f"{where.detail.rstrip()} The parameters need not give this point: it is of the hull of their "
+            "functions, over which the inequalities have no solution then. Give a smaller region.",
         )
-        words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(scheduling.names, middle, strict=True))
-        yield f"the middle of the region ({words})", plant.at(middle.tolist())
+
+
+def frozen_points(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
+    """Yield every vertex, the middle of the region, and points where an entry vanishes: a parameter may rest there."""
+    scheduling = plant.scheduling
+    for place, vertex in enumerate(plant.vertices):
+        yield FrozenPoint(scheduling.vertex_name(place), vertex, scheduling.is_linear)
+    if plant.count == 1:
+        return
+    middle = (
+        np.full(plant.count, 1.0 / plant.count)
+        if scheduling.gives_weights
+        else 0.5 * (scheduling.low + scheduling.high)
+    )
+    words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(scheduling.names, middle, strict=True))
+    yield FrozenPoint(f"the middle of the region ({words})", plant.at(middle.tolist()))
+    yield from _vanishing_entries(plant)
+
+
+def _vanishing_entries(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
+    """Yield points between two vertices, or along one function in the middle of the others, where an entry is zero."""
+    scheduling, known = plant.scheduling, set[tuple[int, float]]()
+    for place, (name, first, last) in enumerate(_lines(plant)):
+        ends = {key: _ends(plant, key, first, last) for key in SCHEDULED_MATRICES if not plant.is_constant(key)}
+        shares = {key: _sign_changes(*pair) for key, pair in ends.items()}
+        for share in sorted({float(each) for found in shares.values() for each in found[np.isfinite(found)]}):
+            if share == 0.5 or (place, share) in known:
+                continue  # the middle is looked at already
+            known.add((place, share))
+            if len(known) > MOST_VANISHING:
+                return
+            point = plant.mean((1.0 - share) * first + share * last)
+            # Rounding of the mean leaves some 1e-17 where the entry is zero.
+            changed = {key: np.where(shares[key] == share, 0.0, getattr(point, key)) for key in ends}
+            yield FrozenPoint(
+                f"{name(share)}, where an entry vanishes",
+                point.replace(exact=None, **changed),
+                scheduling.is_linear,
+            )
+
+
+def _lines(plant: PolytopicSystem) -> Iterator[tuple[Callable[[float], str], FloatArray, FloatArray]]:
+    """Yield lines through the hull: the words of a point on it, and the weights of its ends."""
+    scheduling, count = plant.scheduling, plant.count
+    if scheduling.gives_weights:
+        for i in range(count):
+            for j in range(i + 1, count):
+                names = scheduling.names[i], scheduling.names[j]
+
+                def weights(share: float, names: tuple[str, str] = names) -> str:
+                    return f"{names[0]} = {1.0 - share:.6g}, {names[1]} = {share:.6g}"
+
+                yield weights, np.eye(count)[i], np.eye(count)[j]
+        return
+    functions, bounds = scheduling.functions, scheduling.bounds
+    for k in range(len(functions)):
+        at_low = scheduling.corners[:, k] == bounds[k, 0]
+
+        def values(share: float, k: int = k) -> str:
+            shares = [share if place == k else 0.5 for place in range(len(functions))]
+            pairs = zip(functions, bounds.tolist(), shares, strict=True)
+            return ", ".join(f"{text} = {low + at * (high - low):.6g}" for text, (low, high), at in pairs)
+
+        yield values, at_low / at_low.sum(), ~at_low / (~at_low).sum()
+
+
+def _ends(plant: PolytopicSystem, key: str, first: FloatArray, last: FloatArray) -> tuple[FloatArray, FloatArray]:
+    stacked = np.array([getattr(vertex, key) for vertex in plant.vertices])
+    return np.tensordot(first, stacked, axes=1), np.tensordot(last, stacked, axes=1)
+
+
+def _sign_changes(first: FloatArray, last: FloatArray) -> FloatArray:
+    """Return at which share of the way every entry is zero; NaN where it does not change its sign."""
+    change = first * last < 0.0
+    return np.where(change, first / np.where(change, first - last, 1.0), np.nan)
 
 
 def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
@@ -103,13 +186,13 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
     yield constant
     if not constant.holds:
         return
-    for where, point in frozen_points(plant):
-        for condition in fault_filter_conditions(point, exactly=exactly):
+    for point in frozen_points(plant):
+        for condition in fault_filter_conditions(point.plant, exactly=exactly):
             if condition.name == "discrete time" and not condition.holds:
                 yield replace(condition, detail=_CONTINUOUS)
                 return
             if not condition.holds:
-                yield replace(condition, name=f"{condition.name} at {where}")
+                yield point.failing(condition)
                 return
     yield Condition(
         "filter at every vertex",
@@ -132,7 +215,9 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         np.inf if reach is None else reach,
         np.inf,
         _SOURCE,
-        "" if reach is not None else "between the vertices some fault may have no effect",
+        ""
+        if reach is not None
+        else "between the vertices some fault may have no effect: give a smaller region, in which it keeps one",
         of_the_method=True,
     )
     if reach is None:

@@ -37,15 +37,15 @@ def _in_order(plant: PolytopicSystem, model: Exosystem, exactly: bool) -> Iterat
     yield constant
     if not constant.holds:
         return
-    for where, point in frozen_points(plant):
-        at_point = existence(point, model, exactly=exactly)
+    for point in frozen_points(plant):
+        at_point = existence(point.plant, model, exactly=exactly)
         for condition in at_point.conditions:
             if not condition.holds:
-                yield replace(condition, name=f"{condition.name} at {where}")
+                yield point.failing(condition)
                 return
         if at_point.transformation is not None:
             yield Condition(
-                f"(D1) decoupling at {where}",
+                f"(D1) decoupling at {point.where}",
                 "(D1) holds with the algebraic states in place",
                 False,
                 0.0,
