@@ -95,13 +95,13 @@ def wang_without_gain(
         least = block_diag(value, gamma_squared * np.eye(nd)) - weight.T @ weight
         values, vectors = np.linalg.eigh((least + least.T) / 2.0)
         root = vectors / np.sqrt(np.maximum(values, SOLVED_SHARE * values[-1]))
-        driven, seen = (root.T @ part.T for part in (G, H))
-        R = X @ np.linalg.lstsq(seen, driven, rcond=None)[0].T
-        turned = np.linalg.solve(X, written_in.X)
-        own = turned.T @ value @ turned
+        scaled_G, scaled_H = (root.T @ part.T for part in (G, H))
+        R = X @ np.linalg.lstsq(scaled_H, scaled_G, rcond=None)[0].T
+        change = np.linalg.solve(X, written_in.X)
+        P_value = change.T @ value @ change
         gain = np.linalg.solve(written_in.X, R @ written_in.V.T - written_in.R0) @ np.linalg.pinv(written_in.rest)
-        variables["P"].save_value((own + own.T) / 2.0)
-        variables["Y"].save_value(own @ gain)
+        variables["P"].save_value((P_value + P_value.T) / 2.0)
+        variables["Y"].save_value(P_value @ gain)
         if level is None:
             variables["gamma_squared"].save_value(np.asarray(gamma_squared * unit**2))
         if own_weight is not None:

@@ -127,11 +127,13 @@ def estimation_problem(
     if not exact:
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
     # Of what no output shows nothing is told, and nothing need be told.
-    seen = seen_part(form.A, bh, form.C, dh)
-    wanted, reference = _told_from_outputs(seen.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
-    a, c, bw = seen.states @ form.A @ seen.states.T, form.C @ seen.states.T, seen.states @ bw
-    hidden = seen.states @ bh @ seen.inputs, dh @ seen.inputs
-    selection = wanted @ seen.inputs[:nf] if exact else np.zeros((0, seen.inputs.shape[1]))
+    visible = seen_part(form.A, bh, form.C, dh)
+    wanted, reference = (
+        _told_from_outputs(visible.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
+    )
+    a, c, bw = visible.states @ form.A @ visible.states.T, form.C @ visible.states.T, visible.states @ bw
+    hidden = visible.states @ bh @ visible.inputs, dh @ visible.inputs
+    selection = wanted @ visible.inputs[:nf] if exact else np.zeros((0, visible.inputs.shape[1]))
     lags = np.broadcast_to(np.asarray(0 if delay is None else delay, dtype=np.int64), (len(wanted),))
     if reference is not None and exact and plant.dt > 0.0:
         dead, reference = _without_dead_samples(reference, longest=len(form.A) + len(reference[0]) + 1)

@@ -253,8 +253,8 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
             B, D = np.hstack([B, np.zeros((n, rows))]), np.hstack([D, noise * size * np.eye(rows)])
         if noise and not problem.B.any() and not problem.D.any():
             # Without any noise, modes that last are forgotten as fast as they are seen.
-            seen = max(float(np.linalg.norm(problem.C)), SMALLEST)
-            B, D = np.hstack([B, noise * size / seen * np.eye(n)]), np.hstack([D, np.zeros((rows, n))])
+            output_size = max(float(np.linalg.norm(problem.C)), SMALLEST)
+            B, D = np.hstack([B, noise * size / output_size * np.eye(n)]), np.hstack([D, np.zeros((rows, n))])
         try:
             _, K, R = _kalman(replace(problem, B=B, D=D))
         except (np.linalg.LinAlgError, ValueError) as error:

@@ -53,5 +53,5 @@ def seen_part(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> See
     both = np.hstack(vectors)
     basis, values, _ = np.linalg.svd(both[:n])
     states = basis[:, int(np.sum(values > WINDOW_RANK_TOLERANCE)) :].T
-    kept = np.linalg.svd(np.vstack([d, states @ b]))[2][: inputs - hidden].T
-    return SeenPart(states, kept, both[n:])
+    visible_inputs = np.linalg.svd(np.vstack([d, states @ b]))[2][: inputs - hidden].T
+    return SeenPart(states, visible_inputs, both[n:])

@@ -157,8 +157,8 @@ class SensorTiming:
             after, row = inner(states[t], outputs[t], inputs[t])
             if t + 1 < len(states):
                 states[t + 1] = after
-        kept = slice(max(len(states) - self.longest, 0), None)
-        return WaitingState(tuple(states[kept]), after, outputs[kept], inputs[kept]), row
+        waiting = slice(max(len(states) - self.longest, 0), None)
+        return WaitingState(tuple(states[waiting]), after, outputs[waiting], inputs[waiting]), row
 
 
 def require_plain(observer: Any, user: str) -> None:

@@ -282,10 +282,10 @@ class _RecursiveLinearisation(StepLinearisation):
         ne, right = len(step.A), right_side(step, node.origin[:, 0], node.origin[:, 1:], before, y, u)
         spread, unknown = (np.zeros((len(step.H), part.shape[1])) for part in (node.factor, node.diffuse))
         spread[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
-        kept = ~np.isnan(right[:, 0])
+        received = ~np.isnan(right[:, 0])
         parts = (step.H, spread, step.noise, right, unknown)
-        complete = bool(kept.all())
-        solved, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
+        complete = bool(received.all())
+        solved, back = joint_step(*(parts if complete else tuple(part[received] for part in parts)), complete=complete)
         return Node(*solved, back)
 
     def _information(

@@ -218,9 +218,9 @@ class ConstantsBox:
             )
         else:
             text = f"{names} within their ranges"
-        kept = "the same at all times" if self.variation == "constant" else "they may change from sample to sample"
+        variation = "the same at all times" if self.variation == "constant" else "they may change from sample to sample"
         origin = "" if self.source == "stated" else f"; {self.origin}"
-        return f"constants ({text}; {kept}{origin})"
+        return f"constants ({text}; {variation}{origin})"
 
     @property
     def offsets(self) -> FloatArray:

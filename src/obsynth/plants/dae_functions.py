@@ -93,11 +93,11 @@ def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
     residual, X = _stage_equations(symbols, stages, start, dt, weights), ca.vec(stages)
     inputs = [X, start, symbols.u, symbols.theta, dt]
     jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
-    seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
+    outputs = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
     return (
         _dense("residual", inputs, [residual, jacobians[0]]),
         _dense("derivatives", inputs, jacobians),
-        _dense("outputs", [symbols.x, symbols.theta], seen),
+        _dense("outputs", [symbols.x, symbols.theta], outputs),
     )
 
 

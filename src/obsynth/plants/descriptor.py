@@ -271,12 +271,14 @@ class DescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
+        arguments = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
-        gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
+        gone -= {
+            name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else arguments[field])
+        }
         for label in ("operating_point", "scales", "units", "delays"):
-            kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
-        new = DescriptorSystem(**{**kept, **changes})
+            arguments[label] = {name: value for name, value in arguments[label].items() if name not in gone}
+        new = DescriptorSystem(**{**arguments, **changes})
         if self.uncertainty is not None and "uncertainty" not in changes:
             moved = [
                 name

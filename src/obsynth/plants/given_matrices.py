@@ -130,21 +130,21 @@ def plant_fields(
         raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
     problems.raise_if_any()
-    given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
+    checked: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
     for name, value in matrices.items():
         if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
-            given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
-    more = _appended(matrices, labels, given, sensor_noise, problems)
-    sizes = {"x": nx, **signal_counts(given)}
+            checked[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+    more = _appended(matrices, labels, checked, sensor_noise, problems)
+    sizes = {"x": nx, **signal_counts(checked)}
     # What depends on a matrix that could not be read is not judged: its own message is enough.
-    broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
+    broken = {name for name, value in matrices.items() if value is not None and checked.get(name) is None}
     unknown = {
         signal
         for signal, telling in COUNTED_BY.items()
-        if broken.intersection(telling) and all(given.get(name) is None for name in telling)
+        if broken.intersection(telling) and all(checked.get(name) is None for name in telling)
     }
     values: dict[str, Any] = {
-        name: problems.shaped(given.get(name), name, (sizes[rows], sizes[columns]))
+        name: problems.shaped(checked.get(name), name, (sizes[rows], sizes[columns]))
         for name, rows, columns in MATRIX_LAYOUT
         if not unknown.intersection((rows, columns))
     }

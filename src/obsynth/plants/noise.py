@@ -80,10 +80,10 @@ def kept_share(correlation: float, dt: float, integration: str) -> float:
 
 def process_variance(variance: float, correlation: float, dt: float, integration: str) -> float:
     """Return the variance per step on the equation of coloured noise, so that the noise has the stated variance."""
-    kept = kept_share(correlation, dt, integration)
+    share = kept_share(correlation, dt, integration)
     if integration not in BUTCHER:
-        return variance * (1.0 - kept**2)
-    return variance * (1.0 + kept) / (correlation**2 * (1.0 - kept))
+        return variance * (1.0 - share**2)
+    return variance * (1.0 + share) / (correlation**2 * (1.0 - share))
 
 
 def noise_variance(process: float, correlation: float, dt: float, integration: str) -> float:
@@ -140,8 +140,8 @@ def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> di
             continue
         wrong = [key for key in item if key not in ("deviation", "correlation", "white")]
         if wrong or "deviation" not in item:
-            told = f"has no {wrong[0]!r}" if wrong else "needs a deviation"
-            raise SpecError(f"{path} {told}: it takes deviation, correlation and white.", path=path)
+            problem = f"has no {wrong[0]!r}" if wrong else "needs a deviation"
+            raise SpecError(f"{path} {problem}: it takes deviation, correlation and white.", path=path)
         deviation = stated_number(item["deviation"], f"{path}.deviation")
         if item.get("correlation") is None:
             noises[name] = SensorNoise(0.0, 0.0, deviation)

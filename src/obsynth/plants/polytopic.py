@@ -100,20 +100,25 @@ class PolytopicSystem:
     ) -> None:
         if (vertices is None) == (plant is None):
             raise SpecError("Give vertices, or plant with expressions and scheduling.", path="vertices")
-        given: dict[str, Any]
+        arguments: dict[str, Any]
         if vertices is not None:
             if constants:
                 raise SpecError("constants are for plant, whose entries may be expressions.", path="constants")
             dense_vertices, held = _from_vertices(vertices, scheduling)
-            given = {"vertices": [vertex.as_dict() for vertex in dense_vertices], "scheduling": _plain(scheduling)}
+            arguments = {"vertices": [vertex.as_dict() for vertex in dense_vertices], "scheduling": _plain(scheduling)}
         else:
             numbers = _constants(constants)
             dense_vertices, held = _from_expressions(plant or {}, scheduling, numbers)
-            given = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
+            arguments = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
         if shift is not None and shift not in dense_vertices[0].input_names:
             raise SpecError(f"shift is {shown(shift)}, which is no input of the plant.", path="shift")
-        given |= {} if shift is None else {"shift": shift}
-        for name, value in (("vertices", dense_vertices), ("scheduling", held), ("shift", shift), ("_given", given)):
+        arguments |= {} if shift is None else {"shift": shift}
+        for name, value in (
+            ("vertices", dense_vertices),
+            ("scheduling", held),
+            ("shift", shift),
+            ("_given", arguments),
+        ):
             object.__setattr__(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -163,8 +168,10 @@ class PolytopicSystem:
         """
         values = self.scheduling.values(parameters)
         if not self.scheduling.is_inside(values):
-            told = ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.scheduling.names, values, strict=True))
-            raise SpecError(f"{told} is outside the region: {self.scheduling.sentence()}.", path="scheduling")
+            point = ", ".join(
+                f"{name} = {value:.6g}" for name, value in zip(self.scheduling.names, values, strict=True)
+            )
+            raise SpecError(f"{point} is outside the region: {self.scheduling.sentence()}.", path="scheduling")
         return self.scheduling.weights(values)
 
     def at(self, parameters: Mapping[str, float] | Sequence[float]) -> DescriptorSystem:

@@ -116,9 +116,9 @@ class MatrixSequence:
     def _computed(self, k: int) -> FloatArray:
         if self.function is not None:
             return as_matrix(self.function(k), f"{self.name}({k})")
-        kept = self.computed.get(k)
-        if kept is not None:
-            return kept
+        remembered = self.computed.get(k)
+        if remembered is not None:
+            return remembered
         values = {**(self.constants or {}), INDEX_NAME: np.float64(k)}
         matrix = np.array(self.still)
         for i, j in self.moving:

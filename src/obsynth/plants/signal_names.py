@@ -50,25 +50,25 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     if names is None:
         return tuple(f"{prefix}{i + 1}" for i in range(count))
     names = plain_names(names)
-    given = tuple(names) if isinstance(names, Iterable) else (names,)
-    if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
+    listed = tuple(names) if isinstance(names, Iterable) else (names,)
+    if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in listed):
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
-    if len(given) != count:
+    if len(listed) != count:
         there = counted(count, *_COUNTED[what]) if what in _COUNTED else f"{count}"
-        raise SpecError(f"{what} has {counted(len(given), 'name')}, but the plant has {there}.", path=what)
+        raise SpecError(f"{what} has {counted(len(listed), 'name')}, but the plant has {there}.", path=what)
     unwritable = [
         name
-        for name in given
+        for name in listed
         if not name.isprintable() and any(unicodedata.category(sign) in _UNWRITABLE for sign in name)
     ]
     if unwritable:
         raise SpecError(
             f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.", path=what
         )
-    repeated = sorted(name for name, times in Counter(given).items() if times > 1)
+    repeated = sorted(name for name, times in Counter(listed).items() if times > 1)
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
-    return given
+    return listed
 
 
 def plain_names(names: Any) -> Any:
@@ -114,14 +114,14 @@ def _closest(name: str, known: Sequence[str]) -> list[str]:
 def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
     """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
     present = sorted(known)
-    told = [
+    problems = [
         f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), present)}"
         for name in given
         if name not in present
     ]
-    if len(told) == 1 and told[0].endswith("plant."):
-        told[0] += _there_are(present)
-    raise_problems(told, f"{what} names {len(told)} that are no {kind} of the plant:", what)
+    if len(problems) == 1 and problems[0].endswith("plant."):
+        problems[0] += _there_are(present)
+    raise_problems(problems, f"{what} names {len(problems)} that are no {kind} of the plant:", what)
 
 
 def require_picked(picked: Iterable[str], names: Sequence[str], *, what: str) -> None:

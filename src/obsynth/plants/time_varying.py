@@ -262,10 +262,10 @@ class TimeVaryingDescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        kept = self.matrices
+        matrices = self.matrices
         if self.D.is_constant and not self.D.at(1).any():
-            del kept["D"]  # none, whatever the number of inputs and outputs is then
-        return TimeVaryingDescriptorSystem(**{**kept, **self._labels(), **changes})
+            del matrices["D"]  # none, whatever the number of inputs and outputs is then
+        return TimeVaryingDescriptorSystem(**{**matrices, **self._labels(), **changes})
 
     def _labels(self) -> dict[str, Any]:
         names = ("state_names", "input_names", "output_names", "parameter_names")

@@ -105,7 +105,7 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
     )
     if wrong:
         return
-    kept = [name for name in recovery.names if name in plant.state_names]
+    names = [name for name in recovery.names if name in plant.state_names]
     whole = np.hstack(
         [
             recovery.from_state,
@@ -115,8 +115,8 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
             recovery.from_noise,
         ]
     )
-    rows = [recovery.names.index(name) for name in kept]
-    expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in kept]]
+    rows = [recovery.names.index(name) for name in names]
+    expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in names]]
     yield upper_bound_check(
         "recovery of kept states",
         "a state that the plant still has is recovered as itself",
@@ -124,7 +124,7 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
         EQUALITY_TOLERANCE,
         source=source,
         kind="equality",
-        detail=f"{len(kept)} of {len(recovery.names)} states; how the others follow from these is not checked",
+        detail=f"{len(names)} of {len(recovery.names)} states; how the others follow from these is not checked",
     )
 
 
@@ -143,8 +143,8 @@ def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
         matrix = getattr(recovery, field)
         if matrix.shape != (len(names), width) or not np.all(np.isfinite(matrix)):
             wrong.append(field)
-    kept = recovery.noise_kept
-    if kept.ndim != 2 or kept.shape[1] != plant.nw or not np.all(np.isfinite(kept)):
+    noise = recovery.noise_kept
+    if noise.ndim != 2 or noise.shape[1] != plant.nw or not np.all(np.isfinite(noise)):
         wrong.append("noise_kept")
     return wrong
 
@@ -158,10 +158,10 @@ def closed_claims(
 ) -> Iterator[Check]:
     """Yield the row on claims that no row covers (``covered``, by claim), and one for each that is only stated."""
     # Where a row fails already nothing more is said: a report that ends early covers little.
-    given = tuple(rows)
-    if not all(row.passed for row in given):
+    listed = tuple(rows)
+    if not all(row.passed for row in listed):
         return
-    names = {row.name for row in given}
+    names = {row.name for row in listed}
     claims = design.certificate.claims
     wrong = []
     for name, value in claims.items():
@@ -225,8 +225,8 @@ def fault_noise_rows(errors: ErrorModel) -> Iterator[Check]:
         return
     shown, _, _, direct = errors.fault_output
     # What noise does to an estimate at once has no finite variance in continuous time, and is left out.
-    seen = direct if plant.dt > 0.0 else 0.0 * direct
-    covariance = certain_noise_covariance(errors.Az, errors.noise, shown, seen, plant.dt)
+    direct_noise = direct if plant.dt > 0.0 else 0.0 * direct
+    covariance = certain_noise_covariance(errors.Az, errors.noise, shown, direct_noise, plant.dt)
     for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
         yield information(
             f"noise in fhat[{name}]",

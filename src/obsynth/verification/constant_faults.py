@@ -221,13 +221,13 @@ def _settled(given: ConstantFaults, observer: LinearObserver, kind: type[Enclose
     state = enclosed_solution(e - a if plant.dt > 0.0 else -a, kind.exact(plant.Bf[:, own]))
     if state is None:
         return None
-    seen = c @ state + kind.exact(plant.Df[:, own])
-    inner = _driven(observer, kind.exact(observer.By) @ seen, kind)
+    outputs = c @ state + kind.exact(plant.Df[:, own])
+    inner = _driven(observer, kind.exact(observer.By) @ outputs, kind)
     if inner is None:
         return None
-    kept = _seen_by_faults(observer)
-    shown = kind.exact(observer.Cz[rows][:, kept]) @ inner + kind.exact(observer.Dy[rows]) @ seen
-    return _Settled(seen, inner, shown)
+    states = _seen_by_faults(observer)
+    shown = kind.exact(observer.Cz[rows][:, states]) @ inner + kind.exact(observer.Dy[rows]) @ outputs
+    return _Settled(outputs, inner, shown)
 
 
 def _as_it_runs(given: ConstantFaults, sizes: FloatArray, missed: float) -> tuple[float, str]:
@@ -256,8 +256,8 @@ def _as_it_runs(given: ConstantFaults, sizes: FloatArray, missed: float) -> tupl
 
 def _settling_time(observer: LinearObserver) -> float:
     """Return in how many samples the slowest of the states that reach a fault estimate decays to 1/e."""
-    kept = _seen_by_faults(observer)
-    slowest = float(np.max(np.abs(np.linalg.eigvals(observer.Az[np.ix_(kept, kept)])), initial=0.0))
+    states = _seen_by_faults(observer)
+    slowest = float(np.max(np.abs(np.linalg.eigvals(observer.Az[np.ix_(states, states)])), initial=0.0))
     return 1.0 / (1.0 - slowest) if slowest < 1.0 else np.inf
 
 
@@ -305,9 +305,9 @@ def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | Non
         motion = kind.exact(np.vstack([np.zeros((len(model.E) - len(still), len(own))), still]))
         tracked = kind.exact(model.T) @ (kind.exact(model.E) @ motion)
         ahead = kind.exact(model.T) @ (kind.exact(model.A) @ motion)
-        seen = kind.exact(model.C) @ motion
-        driven = kind.exact(observer.Az) @ tracked + by @ seen - ahead
-        direct = kind.exact(observer.Cz[rows]) @ tracked + dy @ seen - _goal(given, kind)
+        outputs = kind.exact(model.C) @ motion
+        driven = kind.exact(observer.Az) @ tracked + by @ outputs - ahead
+        direct = kind.exact(observer.Cz[rows]) @ tracked + dy @ outputs - _goal(given, kind)
         if model.T0 is not None:
             direct = direct + kind.exact(model.T0[rows]) @ (kind.exact(model.A) @ motion)
     shown = _shown(observer, driven, kind)
@@ -317,26 +317,26 @@ def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | Non
 def _shown(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the fault estimates show in the end of what drives the observer's state all the time."""
     state = _driven(observer, driven, kind)
-    kept = _seen_by_faults(observer)
-    return None if state is None else kind.exact(observer.Cz[observer.fault_rows][:, kept]) @ state
+    states = _seen_by_faults(observer)
+    return None if state is None else kind.exact(observer.Cz[observer.fault_rows][:, states]) @ state
 
 
 def _driven(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
     """Return where the observer's states that reach a fault estimate settle under what drives all of them."""
-    kept = _seen_by_faults(observer)
-    taking = kind.exact(np.eye(observer.order)[kept])
-    az = kind.exact(observer.Az[np.ix_(kept, kept)])
-    pencil = kind.exact(np.eye(len(kept))) - az if observer.dt > 0.0 else -az
+    states = _seen_by_faults(observer)
+    taking = kind.exact(np.eye(observer.order)[states])
+    az = kind.exact(observer.Az[np.ix_(states, states)])
+    pencil = kind.exact(np.eye(len(states))) - az if observer.dt > 0.0 else -az
     return enclosed_solution(pencil, taking @ driven)
 
 
 @remembered
 def _seen_by_faults(observer: LinearObserver) -> IntArray:
     """Return the observer's states that reach a fault estimate, at once or later: not the registers of past states."""
-    kept = np.any(observer.Cz[observer.fault_rows] != 0.0, axis=0)
-    while np.any(more := np.any(observer.Az[kept] != 0.0, axis=0) & ~kept):
-        kept |= more
-    return np.flatnonzero(kept)
+    reaching = np.any(observer.Cz[observer.fault_rows] != 0.0, axis=0)
+    while np.any(more := np.any(observer.Az[reaching] != 0.0, axis=0) & ~reaching):
+        reaching |= more
+    return np.flatnonzero(reaching)
 
 
 def _settles(model: ErrorModel, rate: float) -> bool:

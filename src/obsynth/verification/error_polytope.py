@@ -80,8 +80,8 @@ class ErrorPolytope:
         D = _each(self.D, "D", count) if self.D is not None else (np.zeros((m, p)),) * count
         Dz = _each(self.Dz, "Dz", count) if self.Dz is not None else (np.zeros((q, p)),) * count
         shapes = {"A": (n, n), "C": (m, n), "B": (n, p), "D": (m, p), "Cz": (q, n), "Dz": (q, p)}
-        given = {"A": A, "C": C, "B": B, "D": D, "Cz": Cz, "Dz": Dz}
-        for name, matrices in given.items():
+        matrices_of = {"A": A, "C": C, "B": B, "D": D, "Cz": Cz, "Dz": Dz}
+        for name, matrices in matrices_of.items():
             for matrix in matrices:
                 require_shape(matrix.shape, shapes[name], name)
         if self.differential is not None and (not 0 < self.differential <= n or self.dt > 0.0):
@@ -92,7 +92,7 @@ class ErrorPolytope:
             raise SpecError("ball must be a finite number, 0 or more.", path="ball")
         if self.ball and self.differential not in (None, n):
             raise SpecError("A remainder beside A is for errors that are all differential.", path="ball")
-        for name, matrices in given.items():
+        for name, matrices in matrices_of.items():
             object.__setattr__(self, name, tuple(read_only(matrix) for matrix in matrices))
 
     @property

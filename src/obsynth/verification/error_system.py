@@ -243,8 +243,8 @@ class ErrorModel:
         """Return ``C, Df, Dd, Dw`` of some rows, which are ``-C e + Df f + Dd d + Dw w`` (states: the error)."""
         plant, direct = self.plant, self.observer.Dy[rows]
         added = np.zeros((len(direct), plant.nx)) if self.T0 is None else self.T0[rows, : plant.nx]
-        seen = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
-        fault, disturbance, noise = (direct @ d + added @ b for b, d in seen)
+        signals = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
+        fault, disturbance, noise = (direct @ d + added @ b for b, d in signals)
         return self.observer.Cz[rows], fault, disturbance, noise
 
     @cached_property
@@ -314,13 +314,15 @@ class ErrorModel:
         shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
         if self.T0 is not None:
             shown = shown + size(self.T0) @ size(self.A)
-        followed, told = (np.max(terms * units, axis=1, initial=0.0, keepdims=True) for terms in (formed, shown))
-        return units, np.where(followed > 0.0, followed, 1.0), np.where(told > 0.0, told, 1.0)
+        state_sizes, output_sizes = (
+            np.max(terms * units, axis=1, initial=0.0, keepdims=True) for terms in (formed, shown)
+        )
+        return units, np.where(state_sizes > 0.0, state_sizes, 1.0), np.where(output_sizes > 0.0, output_sizes, 1.0)
 
     def rounding(self) -> float:
         """Return how much K and J are at most of the largest terms of their rows, in natural units of the states."""
-        units, followed, told = self._sizes
-        pairs = ((self.remainder.K.midpoint, followed), (self.remainder.J.midpoint, told))
+        units, state_sizes, output_sizes = self._sizes
+        pairs = ((self.remainder.K.midpoint, state_sizes), (self.remainder.J.midpoint, output_sizes))
         return max(float(np.max(np.abs(missed) * units / rows, initial=0.0)) for missed, rows in pairs)
 
     def missed(self) -> float:
@@ -432,8 +434,8 @@ class RemainderChannel:
             # The rows that matter most get a tighter one.
             bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
             # Of what is nothing exactly nothing comes.
-            seen = np.where(_there(direct), direct.magnitude, 0.0)
-            bound = np.where(np.any(_there(k), axis=0), bound, 0.0) + seen
+            direct_bound = np.where(_there(direct), direct.magnitude, 0.0)
+            bound = np.where(np.any(_there(k), axis=0), bound, 0.0) + direct_bound
             errors.append(np.where(bound > 0.0, rounded_up(bound, 2), 0.0))
         return tuple(errors)
 

@@ -215,7 +215,7 @@ def _in_units(identities: dict[str, Identity], model: ErrorModel, scaling: Scali
     }
     # Outputs that see no state may be all it takes; the others are then rounding errors of those.
     taken = np.max(by / scaling.outputs, axis=1, keepdims=True)
-    seen = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
+    output_sizes = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
     first, last = identities["dynamics"].factors
-    scaled["dynamics"] = replace(scaled["dynamics"], factors=(first, (taken, seen), last))
+    scaled["dynamics"] = replace(scaled["dynamics"], factors=(first, (taken, output_sizes), last))
     return scaled

@@ -63,12 +63,12 @@ class Setting(NamedTuple):
 
 def seen_plant(plant: DescriptorSystem, decoupled: Sequence[str]) -> DescriptorSystem:
     """Return the plant in which disturbances that are not ``decoupled`` count as noise, before the noise."""
-    kept = [plant.disturbance_names.index(name) for name in decoupled]
-    bounded = [i for i in range(plant.nd) if i not in kept]
+    columns = [plant.disturbance_names.index(name) for name in decoupled]
+    bounded = [i for i in range(plant.nd) if i not in columns]
     return plant.replace(
-        Bd=plant.Bd[:, kept],
-        Dd=plant.Dd[:, kept],
-        disturbance_names=[plant.disturbance_names[i] for i in kept],
+        Bd=plant.Bd[:, columns],
+        Dd=plant.Dd[:, columns],
+        disturbance_names=[plant.disturbance_names[i] for i in columns],
         Bw=np.hstack([plant.Bd[:, bounded], plant.Bw]),
         Dw=np.hstack([plant.Dd[:, bounded], plant.Dw]),
         noise_names=[*(plant.disturbance_names[i] for i in bounded), *plant.noise_names],
@@ -278,15 +278,16 @@ class _Trajectories:
             powers = [power * point for power, point in zip(powers, points, strict=True)]
         count = len(points) + rest[0].ncols()
         padded = [_padded(part, count) for part in energies]
-        seen = [tail[0] for tail in tails]
+        outputs = [tail[0] for tail in tails]
         for model, inner in zip(self.setting.models, states, strict=True):
-            seen = _recursion(model, _beside([inner, _zeros(inner.nrows(), rest[0].ncols())]), seen)
+            outputs = _recursion(model, _beside([inner, _zeros(inner.nrows(), rest[0].ncols())]), outputs)
         # Of each fault, what the estimate is late by is still to come.
-        delays = self.setting.delays or (0,) * seen[0].nrows()
-        seen = [
-            _rows(part, [i for i, late in enumerate(delays) if k + late < self.samples]) for k, part in enumerate(seen)
+        delays = self.setting.delays or (0,) * outputs[0].nrows()
+        outputs = [
+            _rows(part, [i for i, late in enumerate(delays) if k + late < self.samples])
+            for k, part in enumerate(outputs)
         ]
-        for which, samples in enumerate((seen, [tail[1] for tail in tails])):
+        for which, samples in enumerate((outputs, [tail[1] for tail in tails])):
             for sample in samples:
                 padded[which] = padded[which] + _adjoint(sample) * sample
         return padded[0], padded[1]
@@ -392,8 +393,8 @@ def _from_rest(
         kernel = exact_kernel(system)
     parts = [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
     counted = [*range(estimated), *range(bh.shape[1], count)]
-    kept = _independent(_stacked([_rows(part, counted) for part in parts]))
-    return [_columns(part, kept) for part in parts]
+    independent = _independent(_stacked([_rows(part, counted) for part in parts]))
+    return [_columns(part, independent) for part in parts]
 
 
 def _independent(matrix: Any) -> list[int]:

@@ -139,8 +139,8 @@ class InvisiblePairs:
                 return 0.0
             if not free_weight:
                 zd = _balls(self.Zd)
-                seen = _balls(self.Z) + zd * later
-                shown += (seen * slack * seen.transpose()).trace() + squared_norm(zd * direct)
+                estimates = _balls(self.Z) + zd * later
+                shown += (estimates * slack * estimates.transpose()).trace() + squared_norm(zd * direct)
                 energy += (later * slack * later.transpose()).trace() + squared_norm(direct)
             if not energy > 0 or not shown > 0:
                 return 0.0

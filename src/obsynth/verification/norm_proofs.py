@@ -79,8 +79,8 @@ def _equal_shares(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
     with np.errstate(all="ignore"):
         driven = np.diag(continuous_lyapunov(a, -b @ b.T))
-        seen = np.diag(continuous_lyapunov(a.T, -c.T @ c))
-        exponents = np.round(0.25 * np.log2(driven / seen))
+        observability = np.diag(continuous_lyapunov(a.T, -c.T @ c))
+        exponents = np.round(0.25 * np.log2(driven / observability))
     if not np.all(np.isfinite(exponents)) or np.max(np.abs(exponents)) > MOST_EXPONENT:
         return np.asarray(balanced_matrix(a)[1])
     return np.asarray(np.exp2(exponents))

@@ -255,7 +255,7 @@ def _no_certificate() -> VertexProof:
 
 
 def _proof_row(name: str, claim: str, value: float, proof: VertexProof) -> Check:
-    told = f"{proof.count} matrices positive definite" if proof.proved else f"not proved: {proof.reason}"
+    detail = f"{proof.count} matrices positive definite" if proof.proved else f"not proved: {proof.reason}"
     row = upper_bound_check(
         name,
         claim,
@@ -263,7 +263,7 @@ def _proof_row(name: str, claim: str, value: float, proof: VertexProof) -> Check
         value if proof.proved else -np.inf,
         source="vertex inequalities, proved in balls",
         kind="proved",
-        detail=told,
+        detail=detail,
     )
     return replace(row, margin=proof.margin, passed=proof.proved)
 

@@ -143,7 +143,9 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
             )
         return
     pairs = [(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, errors.bounds, strict=True)]
-    if any(told is not None and told.shape == bound.shape and np.any(bound > told) for bound, told in pairs):
+    if any(
+        shipped is not None and shipped.shape == bound.shape and np.any(bound > shipped) for bound, shipped in pairs
+    ):
         errors = errors.least(observer)
     columns = (model.state_names, plant.input_names, plant.disturbance_names)
     for kind, name, bound, labels in zip(_WITNESS_SIGNALS, _ERROR_WITNESSES, errors.bounds, columns, strict=True):
@@ -274,8 +276,10 @@ class _Composite:
         # The poles of the plant on the boundary or about it; scattered multiple ones have angles next to each other.
         near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
         sorted_angles = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
-        kept = [angle for i, angle in enumerate(sorted_angles) if not i or angle - sorted_angles[i - 1] > APART * unit]
-        angles = np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
+        distinct = [
+            angle for i, angle in enumerate(sorted_angles) if not i or angle - sorted_angles[i - 1] > APART * unit
+        ]
+        angles = np.asarray(distinct[:MOST_ANGLES], dtype=np.float64)
         if few:
             # On both sides of each angle, ever closer to it.
             turning = angles[angles > SLOWEST_CLAIMED * unit][:, None]
@@ -313,13 +317,13 @@ class _Composite:
         else:
             left = modal.rows(points, self.shown)
         ages = np.split(left @ self.K + self.J, self.lags, axis=2)
-        seen = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
+        readings = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
         modal = self._plant_solves
         if modal is None:
             pencils = pencils_at(self.plant.E.T, self.plant.A.T, points)
-            through = np.linalg.solve(pencils, seen.transpose(0, 2, 1)).transpose(0, 2, 1)
+            through = np.linalg.solve(pencils, readings.transpose(0, 2, 1)).transpose(0, 2, 1)
         else:
-            through = modal.rows(points, seen)
+            through = modal.rows(points, readings)
         whole = through @ self.plant.Bd + left @ self.driven + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))
         return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)

@@ -187,10 +187,10 @@ def weight_rows(gains: Mapping[str, FloatArray], weight: object) -> Iterator[Che
 def _as_weight(weight: object, shape: tuple[int, ...]) -> FloatArray:
     """Return a stored weight as an array; NaN, which no W equals, where it is none of this shape."""
     try:
-        given = np.array(weight, dtype=np.float64)
+        matrix = np.array(weight, dtype=np.float64)
     except (TypeError, ValueError):
-        given = np.zeros(0)
-    return given if given.shape == shape else np.full(shape, np.nan)
+        matrix = np.zeros(0)
+    return matrix if matrix.shape == shape else np.full(shape, np.nan)
 
 
 def printed_allowances(

@@ -105,14 +105,14 @@ class ErrorChannel:
         (noise, through), a, c = driven(plant.Bw, plant.Dw), exact(observer.Az), -exact(observer.Cz)
         if self.matched is None:
             return a, noise, c, through
-        fault, seen = driven(plant.Bf, plant.Df)
+        fault, direct_fault = driven(plant.Bf, plant.Df)
         ar, br, cr, dr = (exact(part) for part in self.matched)
         n, k = observer.order, len(self.matched[0])
         return (
             kind.blocks([[a, zero(n, k)], [zero(k, n), ar]]),
             kind.blocks([[fault, noise], [br, zero(k, plant.nw)]]),
             kind.blocks([[c, -cr]]),
-            kind.blocks([[seen - dr, through]]),
+            kind.blocks([[direct_fault - dr, through]]),
         )
 
 

@@ -182,9 +182,9 @@ def _unweighted_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultM
     if asked.reference is not None:
         yield FaultMap(None, reference_model(asked.reference, plant), asked.exact)
     elif plant.is_discrete:
-        given = delays_of(asked.delay, plant)
-        tried = range(plant.nx + 2 if None in given else 1)
-        yield from (FaultMap(tuple(late if one is None else one for one in given), None, True) for late in tried)
+        delays = delays_of(asked.delay, plant)
+        tried = range(plant.nx + 2 if None in delays else 1)
+        yield from (FaultMap(tuple(late if one is None else one for one in delays), None, True) for late in tried)
     else:
         width = cayley_point(scipy.linalg.eigvals(plant.A, plant.E))
         yield from (FaultMap(None, lag_model(width, order, plant.nf, 0.0), True) for order in range(1, plant.nx + 2))

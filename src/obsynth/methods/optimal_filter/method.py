@@ -143,10 +143,10 @@ class OptimalFilterMethod(Method):
     def decoupled_names(self, plant: DescriptorSystem) -> tuple[str, ...]:
         """Return the disturbances that are decoupled; raise `SpecError` for names that the plant does not have."""
         none: tuple[str, ...] = ()
-        given = none if self.decoupled is None else self.decoupled
-        given = (given,) if isinstance(given, str) else tuple(given)
-        require_known(given, plant.disturbance_names, what=f"{OPTIONS_PATH}.decoupled", kind="disturbance")
-        return tuple(name for name in plant.disturbance_names if name in given)
+        names = none if self.decoupled is None else self.decoupled
+        names = (names,) if isinstance(names, str) else tuple(names)
+        require_known(names, plant.disturbance_names, what=f"{OPTIONS_PATH}.decoupled", kind="disturbance")
+        return tuple(name for name in plant.disturbance_names if name in names)
 
     def as_plain(self) -> dict[str, Any]:
         """Return every option by name, as lists, mappings, numbers and texts."""

@@ -83,8 +83,8 @@ def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list
     minimal_ones = [minimal(filter_, discrete=discrete)]
     if discrete:
         a, b, c, d = filter_
-        kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
-        minimal_ones.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
+        linked = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
+        minimal_ones.append(_balanced((a[np.ix_(linked, linked)], b[linked], c[:, linked], d)))
     return [(a, b * outputs, c, d * outputs) for a, b, c, d in minimal_ones]
 
 
@@ -247,10 +247,10 @@ def _followed(
     # Only the copies that are read.
     basis = reachable_basis(moved.T, np.vstack([into, shown]).T) if count else np.zeros((0, 0))
     into, shown, moved = into @ basis, shown @ basis, basis.T @ moved @ basis
-    copies, kept = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
+    copies, copy_count = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
     follower = Followed(
-        np.block([[a, into], [np.zeros((kept, nz)), moved]]),
-        np.vstack([b, np.zeros((kept, plant.ny))]),
+        np.block([[a, into], [np.zeros((copy_count, nz)), moved]]),
+        np.vstack([b, np.zeros((copy_count, plant.ny))]),
         np.hstack([c, shown]),
         d,
         np.vstack([t, copies]),

@@ -55,10 +55,10 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
     slopes = region.slopes()
     bounds = _stored_bounds(slopes)
     drive = _drive(terms, region, asked, step)
-    given = _given_gain(terms, asked.gains)
+    given_gain = _given_gain(terms, asked.gains)
     progress("solving the inequalities at the corners of the slopes")
     problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
-    solution = problem.solved(asked, given, solver)
+    solution = problem.solved(asked, given_gain, solver)
     progress("proving the shipped numbers")
     claims, matrices = _proved(terms, slopes, bounds, drive, solution, asked, problem)
     gain = solution.gain
@@ -309,9 +309,11 @@ def _fastest(terms: NonlinearTerms, gain: FloatArray) -> float:
 
 
 def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObserverMethod) -> list[str]:
-    seen = {place for place, _, _ in region.measured()}
+    measured = {place for place, _, _ in region.measured()}
     states, _, _ = region.matrices()
-    assumed = [each.text for place, each in enumerate(region.ranges) if place not in seen and bool(states[place].any())]
+    assumed = [
+        each.text for place, each in enumerate(region.ranges) if place not in measured and bool(states[place].any())
+    ]
     notes = [
         f"One certificate at {2 ** len(observer.slopes)} corners of {len(observer.slopes)} slopes, for the region "
         f"{region.sentence()}. A row in which an input, a measurement or an estimate leaves it is out: nothing is "

@@ -12,8 +12,8 @@ from obsynth.observers.linear.observer import LinearObserver
 def averaged(observer: LinearObserver, mean: int) -> LinearObserver:
     """Return the observer whose fault estimates are means of its last ``mean`` ones."""
     rows, order, count = observer.fault_rows, observer.order, len(observer.fault_names)
-    kept = (mean - 1) * count
-    az, cz = np.zeros((order + kept,) * 2), np.zeros((len(observer.Cz), order + kept))
+    register_count = (mean - 1) * count
+    az, cz = np.zeros((order + register_count,) * 2), np.zeros((len(observer.Cz), order + register_count))
     az[:order, :order], cz[:, :order] = observer.Az, observer.Cz
     first = slice(order, order + count)
     az[first, :order] = observer.Cz[rows]
@@ -23,7 +23,7 @@ def averaged(observer: LinearObserver, mean: int) -> LinearObserver:
     cz[rows] = cz[rows] / mean
     for j in range(mean - 1):
         cz[rows, order + j * count : order + (j + 1) * count] = np.eye(count) / mean
-    below = np.zeros((kept - count, 1))
+    below = np.zeros((register_count - count, 1))
 
     def widened(matrix: np.ndarray, direct: np.ndarray) -> np.ndarray:
         return np.vstack([matrix, direct[rows], np.repeat(below, matrix.shape[1], axis=1)])

@@ -239,9 +239,9 @@ def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
         try:
             x = step.solve(x, u, theta, k=k).x
         except SolverError:
-            kept = int(SHARE_OF_SOLVED * len(outputs))
-            if kept <= FEWEST_STEPS:  # the first is none
+            steps = int(SHARE_OF_SOLVED * len(outputs))
+            if steps <= FEWEST_STEPS:  # the first is none
                 raise
-            return np.array(outputs[:kept])
+            return np.array(outputs[:steps])
         outputs.append(step.functions.outputs(x, theta)[0])
     return np.array(outputs)

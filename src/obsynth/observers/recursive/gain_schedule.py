@@ -61,8 +61,10 @@ def gain_steps(
             S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
             H, right = step.H, np.eye(rows) if right is None else right
             if not complete and received is not None:
-                kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
-                H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+                rows_received = np.concatenate(
+                    [np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)]
+                )
+                H, S, right, unknown = H[rows_received], S[rows_received], right[rows_received], unknown[rows_received]
             if solved is None and not unknown.shape[1] and not complete:
                 solved = least_squares_step(H, S, right)
             solved = solved or rank_revealing_step(H, S, right, unknown, mapped=rows)
@@ -99,10 +101,10 @@ def gains_once() -> Gains:
             return
         if observer not in remembered_gains or remembered_gains[observer][0] < steps:
             remembered_gains[observer] = steps, [], gain_steps(observer, steps)
-        _, kept, further = remembered_gains[observer]
+        _, steps_so_far, further = remembered_gains[observer]
         for position in range(steps + int(observer.early_constraints)):
-            if position == len(kept):
-                kept.append(next(further))
-            yield kept[position]
+            if position == len(steps_so_far):
+                steps_so_far.append(next(further))
+            yield steps_so_far[position]
 
     return gains

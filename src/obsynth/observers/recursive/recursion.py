@@ -250,10 +250,10 @@ class Recursion:
         Return also what the literal form learns from."""
         ne, H = len(step.A), step.H
         S, unknown = spreads(step, state.factor, state.diffuse, state.k, self.settings.state_names)
-        kept = ~np.isnan(right[:, 0])
-        complete = bool(kept.all())
+        received = ~np.isnan(right[:, 0])
+        complete = bool(received.all())
         if not complete:
-            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+            H, S, right, unknown = H[received], S[received], right[received], unknown[received]
         solved = None
         if not unknown.shape[1] and S.shape[1] >= len(S):
             solved = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)

@@ -269,8 +269,8 @@ class PreparedStep:
             return last
         same = last if last is not None and last.step.H is step.H else None
         # Once for a run: a varying H is in the same units at every step.
-        kept = last is not None and len(last.step.H) == len(step.H)
-        sizes = last.sizes if last is not None and kept else row_sizes(step.H)
+        same_rows = last is not None and len(last.step.H) == len(step.H)
+        sizes = last.sizes if last is not None and same_rows else row_sizes(step.H)
         projection = projection_of(step.H, sizes=sizes) if same is None else same.projection
         if projection is None:
             return cls(step, None, step.A[:0], step.noise[:0], sizes)

@@ -84,7 +84,7 @@ def from_andes(
         e, a, names = _written_pencil(Path(case))
     else:
         e, a, names, point = _solved_case(case)
-    given = {
+    roles = {
         kind: _names(picked, names, kind)
         for kind, picked in (("outputs", outputs), ("faults", faults), ("disturbances", disturbances))
     }
@@ -92,14 +92,14 @@ def from_andes(
     arguments: dict[str, Any] = {
         "dt": 0.0,
         "state_names": checked_names(names, len(names), prefix="x", what="state_names"),
-        "Bf": given["faults"] or None,
-        "Bd": given["disturbances"] or None,
-        "C": given["outputs"],
+        "Bf": roles["faults"] or None,
+        "Bd": roles["disturbances"] or None,
+        "C": roles["outputs"],
     }
     # A fault and a disturbance are changes: the value of the variable they are named after is not theirs.
     for kind, role, word in (("faults", "fault_names", "change of"), ("disturbances", "disturbance_names", "load on")):
-        if given[kind]:
-            arguments[role] = [f"{word} {name}" for name in given[kind]]
+        if roles[kind]:
+            arguments[role] = [f"{word} {name}" for name in roles[kind]]
     return DescriptorSystem(e, a, **{**arguments, "operating_point": stated, **plant})
 
 

@@ -89,8 +89,8 @@ def from_casadi(
         raise SpecError("y depends on u: outputs are of states and parameters alone.", path="system")
 
     def values(x: Any, u: Any, theta: Any) -> dict[str, Any]:
-        given = {"x": x[:nx], "z": x[nx:], "u": u, "p": theta}
-        return dict(function(**{name: casadi.vertcat(*given[name]) for name in function.name_in()}))
+        columns = {"x": x[:nx], "z": x[nx:], "u": u, "p": theta}
+        return dict(function(**{name: casadi.vertcat(*columns[name]) for name in function.name_in()}))
 
     def equations(rates: Any, x: Any, u: Any, theta: Any) -> list[Any]:
         parts = values(x, u, theta)

@@ -177,17 +177,17 @@ def from_matlab(
     step = _step(fields, dt, unit, source)
     names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
     labels = {ours: names.pop(ours, None) for ours in ("state_names", "input_names", "output_names")}
-    given = {name: _dense_value(fields[name]) for name in (*_MODEL_MATRICES, *_MORE) if name in fields}
+    matrices = {name: _dense_value(fields[name]) for name in (*_MODEL_MATRICES, *_MORE) if name in fields}
     if step == 0.0 and unit != 1.0:
-        given = _per_second(given, unit, source)
+        matrices = _per_second(matrices, unit, source)
     return plant_of(
-        {name: given[name] for name in _MODEL_MATRICES if name in given and np.size(given[name])},
-        {**{name: given[name] for name in _MORE if name in given}, **names, **plant},
+        {name: matrices[name] for name in _MODEL_MATRICES if name in matrices and np.size(matrices[name])},
+        {**{name: matrices[name] for name in _MORE if name in matrices}, **names, **plant},
         labels=labels,
         dt=step,
-        point=_point(fields, labels, given, source),
-        units=_units(fields, labels, given, source),
-        delays=_delays(fields, labels, given, step or unit, source),
+        point=_point(fields, labels, matrices, source),
+        units=_units(fields, labels, matrices, source),
+        delays=_delays(fields, labels, matrices, step or unit, source),
     )
 
 
@@ -287,17 +287,17 @@ def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
     if offsets.size != 1:
         return rest if not offsets.size else dict(fields)
     record = offsets.reshape(-1)[0]
-    given = {name: record[name] for name in offsets.dtype.names if np.size(record[name])}
-    unknown = [name for name in given if name not in (*_OFFSETS, "dx")]
+    values = {name: record[name] for name in offsets.dtype.names if np.size(record[name])}
+    unknown = [name for name in values if name not in (*_OFFSETS, "dx")]
     if unknown:
         raise SpecError(f"{source}: Offsets has the field {unknown[0]!r}; known are dx, x, u, y.", path=str(source))
-    if not _is_at_rest(given.pop("dx", None), given.get("x"), sampled=_is_sampled(fields)):
+    if not _is_at_rest(values.pop("dx", None), values.get("x"), sampled=_is_sampled(fields)):
         raise SpecError(
             f"{source}: by Offsets.dx the operating point is no equilibrium, and deviations from it obey no linear "
             "model without a constant term: linearise in a steady state.",
             path=str(source),
         )
-    return {**rest, **{_OFFSETS[name]: value for name, value in given.items()}}
+    return {**rest, **{_OFFSETS[name]: value for name, value in values.items()}}
 
 
 def _is_sampled(fields: Mapping[str, Any]) -> bool:

@@ -270,12 +270,12 @@ def from_sympy(
     [[-0.5]]
     """
     sympy = imported("sympy", extra="sympy")
-    given = {"A": A, "B": B, "C": C, **plant}
-    symbolic = {name: sympy.Matrix(given[name]) for name in ALL_MATRICES if _is_symbolic(given.get(name), sympy)}
+    matrices = {"A": A, "B": B, "C": C, **plant}
+    symbolic = {name: sympy.Matrix(matrices[name]) for name in ALL_MATRICES if _is_symbolic(matrices.get(name), sympy)}
     free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
     values = {str(name): value for name, value in (parameters or {}).items()}
     _require_values(free, values)
-    arguments = {name: value for name, value in given.items() if value is not None}
+    arguments = {name: value for name, value in matrices.items() if value is not None}
     for name, matrix in symbolic.items():
         numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in matrix.free_symbols}
         arguments[name] = _evaluated(matrix, numbers, name)

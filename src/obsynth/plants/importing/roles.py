@@ -37,13 +37,13 @@ def plant_of(
             more[name] = {**stated, **(more.get(name) or {})}
     faults, disturbances, actuator_faults, sensor_faults = _role_lists(more)
     a = as_matrix(matrices["A"], "A")
-    given = {name: None if value is None else as_matrix(value, name) for name, value in matrices.items()}
-    c = given.get("C")
+    checked = {name: None if value is None else as_matrix(value, name) for name, value in matrices.items()}
+    c = checked.get("C")
     c = np.eye(a.shape[0]) if c is None else c
-    nu = next((m.shape[1] for name in "BD" if (m := given.get(name)) is not None), 0)
+    nu = next((m.shape[1] for name in "BD" if (m := checked.get(name)) is not None), 0)
     inputs = checked_names(labels.get("input_names"), nu, prefix="u", what="input_names")
     outputs = checked_names(labels.get("output_names"), c.shape[0], prefix="y", what="output_names")
-    b, d = _full(given.get("B"), a.shape[0], nu, "B"), _full(given.get("D"), c.shape[0], nu, "D")
+    b, d = _full(checked.get("B"), a.shape[0], nu, "B"), _full(checked.get("D"), c.shape[0], nu, "D")
     both = sorted(set(faults) & set(disturbances))
     if both:
         raise SpecError(f"Input {both[0]!r} is given as a fault and as a disturbance: keep one.", path="faults")
@@ -57,7 +57,7 @@ def plant_of(
     biased = _places(sensor_faults, outputs, "sensor_faults")
     known = [i for i in range(nu) if i not in (*fault, *unknown)]
     arguments: dict[str, Any] = {
-        "E": given.get("E"),
+        "E": checked.get("E"),
         "A": a,
         "B": b[:, known],
         "C": c,

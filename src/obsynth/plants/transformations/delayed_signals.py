@@ -116,8 +116,8 @@ class DelayedSamples:
             way.operating_point,
         )
         count = self.plant.nx - self.source.nx
-        told = f"{count} samples of delayed signals are states ({delays_in_words(self.source.delays)})"
-        texts = (first.description, description, told)
+        of_delays = f"{count} samples of delayed signals are states ({delays_in_words(self.source.delays)})"
+        texts = (first.description, description, of_delays)
         return replace(first, plant=self.plant, description="; ".join(filter(None, texts)), recovery=recovery)
 
 
@@ -132,8 +132,8 @@ def sampled_with_delays(smooth: DescriptorSystem, step: float, hold: Hold, gathe
     size, direct = noise.shape[1], np.flatnonzero(np.any(smooth.Dw, axis=0))
     both = np.hstack([np.vstack([noise, noisy]), np.vstack([np.zeros((smooth.nx, len(direct))), smooth.Dw[:, direct]])])
     names = (*(f"process noise {i + 1}" for i in range(size)), *(smooth.noise_names[i] for i in direct))
-    kept = np.hstack([np.zeros((smooth.nw, size)), np.eye(smooth.nw)[:, direct]])
-    return _with_chains(smooth, step, lags, np.vstack([after, readings]), both, names, kept)
+    noise_kept = np.hstack([np.zeros((smooth.nw, size)), np.eye(smooth.nw)[:, direct]])
+    return _with_chains(smooth, step, lags, np.vstack([after, readings]), both, names, noise_kept)
 
 
 def whole_samples_late(plant: DescriptorSystem) -> DelayedSamples:

@@ -82,10 +82,10 @@ def absorb_delays(
     >>> absorbed.state_names, absorbed.delays
     (('x1', 'u1, 1 sample ago', 'u1, 2 samples ago'), {})
     """
-    given = plant.plant if isinstance(plant, Transformation) else plant
-    if not given.delays:
+    linear = plant.plant if isinstance(plant, Transformation) else plant
+    if not linear.delays:
         return _as_it_is(plant)
-    if given.is_discrete:
+    if linear.is_discrete:
         if order is not None:
             raise SpecError("order is for continuous plants: on samples delays are exact without it.", path="order")
         first = eliminate_algebraic_states(plant)
@@ -93,8 +93,8 @@ def absorb_delays(
         note_source(first.plant, made.plant)
         return made.after(first, "")
     if order is None:
-        raise continuous_with_delays(given)
-    step = _approximated(given.dense(), order)
+        raise continuous_with_delays(linear)
+    step = _approximated(linear.dense(), order)
     return plant.then(step) if isinstance(plant, Transformation) else step
 
 
@@ -132,19 +132,19 @@ def without_delays(plant: Any) -> Any:
     PreconditionError
         It is continuous.
     """
-    given = plant.plant if isinstance(plant, Transformation) else plant
-    if not isinstance(given, DescriptorSystem) or not given.delays:
+    linear = plant.plant if isinstance(plant, Transformation) else plant
+    if not isinstance(linear, DescriptorSystem) or not linear.delays:
         return plant
     return absorb_delays(plant)
 
 
 def require_no_delays(plant: Any, what: str) -> None:
     """Raise `SpecError` where a plant has delays, which ``what`` does not know."""
-    given = plant.plant if isinstance(plant, Transformation) else plant
-    if isinstance(given, DescriptorSystem) and given.delays:
-        way = "absorb_delays(plant)" if given.is_discrete else f"discretise(plant, {sample_time_of_delays(given):g})"
+    linear = plant.plant if isinstance(plant, Transformation) else plant
+    if isinstance(linear, DescriptorSystem) and linear.delays:
+        way = "absorb_delays(plant)" if linear.is_discrete else f"discretise(plant, {sample_time_of_delays(linear):g})"
         raise SpecError(
-            f"{what} takes no plant with delays ({delays_in_words(given.delays)}): give obsynth.{way}, in which they "
+            f"{what} takes no plant with delays ({delays_in_words(linear.delays)}): give obsynth.{way}, in which they "
             "are states.",
             path="delays",
         )
@@ -230,11 +230,11 @@ def _approximated(plant: DescriptorSystem, order: int) -> Transformation:
         made = made.replace(uncertainty=made.uncertainty.left_behind("delays became states"))
     recovery = unchanged_states(plant, made, from_state=np.eye(n, n + p + q))
     good = good_up_to(order) / max(plant.delays.values())
-    told = (
+    note = (
         f"The delays ({delays_in_words(plant.delays)}) are Pade approximations of order {order}, within "
         f"{100 * PADE_SHARE:g} % up to {good:.3g} rad/s: every claim is for that model, not for the delays."
     )
-    return Transformation(plant, made, f"Pade approximations of order {order} of the delays", recovery, notes=(told,))
+    return Transformation(plant, made, f"Pade approximations of order {order} of the delays", recovery, notes=(note,))
 
 
 def _pade(delay: float, order: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

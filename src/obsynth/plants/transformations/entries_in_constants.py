@@ -68,12 +68,12 @@ def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **
 
 def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
     """Return the model with the nominal values of a box, whose constants are parameters then."""
-    kept, changed = (
+    constants, parameters = (
         {name: box.constants[name].nominal if name in box.constants else value for name, value in given.items()}
         for given in (model.constants, model.parameters)
     )
-    same = kept == dict(model.constants) and changed == dict(model.parameters)
-    return promoted(model if same else model.replace(constants=kept, parameters=changed), box.names)
+    same = constants == dict(model.constants) and parameters == dict(model.parameters)
+    return promoted(model if same else model.replace(constants=constants, parameters=parameters), box.names)
 
 
 def entries_in_constants(
@@ -95,7 +95,7 @@ def entries_in(
         for names, values in ((model.input_names, point.u), (model.parameter_names, point.theta))
     )
     local = symbolic_equations(model)(point.rates, point.x, u, theta)
-    value, e, by_state, by_input, by_parameter, y, c, seen = local
+    value, e, by_state, by_input, by_parameter, y, c, outputs_by_parameter = local
     known, unknown, faults = ([int(i) for i in columns[name]] for name in ("B", "Bd", "Bf"))
     b = -by_input[:, known]
     matrices = {
@@ -104,7 +104,7 @@ def entries_in(
         "B": ca.horzcat(b, e @ ca.DM(point.rates)) if moving else b,
         "C": c,
         "Bf": -by_parameter[:, faults],
-        "Df": seen[:, faults],
+        "Df": outputs_by_parameter[:, faults],
         "Bd": -by_input[:, unknown],
     }
     writer = _Writer(symbols)
@@ -118,11 +118,14 @@ def require_linear_beside(model: DAEModel, scheduled: Sequence[str], faults: Seq
     rates, x, u, theta = ([ca.SX.sym(name) for name in names] for names in kinds)
     moving = [*rates, *x, *(s for s in u if s.name() not in scheduled), *(s for s in theta if s.name() in faults)]
     local = symbolic_equations(model)(*(ca.vertcat(ca.SX(0, 1), *each) for each in (rates, x, u, theta)))
-    _, e, by_state, by_input, by_parameter, _, c, seen = local
+    _, e, by_state, by_input, by_parameter, _, c, outputs_by_parameter = local
     chosen = [i for i, name in enumerate(model.parameter_names) if name in faults]
     others = [i for i, name in enumerate(model.input_names) if name not in scheduled]
     equations = ca.horzcat(e, by_state, by_input[:, others], by_parameter[:, chosen])
-    for matrix, names in ((equations, model.equation_names), (ca.horzcat(c, seen[:, chosen]), model.output_names)):
+    for matrix, names in (
+        (equations, model.equation_names),
+        (ca.horzcat(c, outputs_by_parameter[:, chosen]), model.output_names),
+    ):
         for row, place in enumerate(names):
             causes = [each.name() for each in moving if ca.depends_on(matrix[row, :].T, each)]
             if causes:

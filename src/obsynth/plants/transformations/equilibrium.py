@@ -197,7 +197,7 @@ class _Problem:
     def without_root(self, residual: FloatArray, left: FloatArray) -> PreconditionError:
         """Return the refusal: what is left, and the combination of equations that no unknown changes."""
         fixed = left @ (left.T @ residual)
-        names, told = self._combination(fixed * self.weights)
+        names, combination = self._combination(fixed * self.weights)
         rest = ", ".join(
             f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
             for i in np.argsort(-np.abs(residual))[:4]
@@ -205,7 +205,7 @@ class _Problem:
         )
         unknowns = ", ".join(self.names) or "nothing"
         why = (
-            f"No unknown ({unknowns}) changes the combination {told} of the equations, which is not zero."
+            f"No unknown ({unknowns}) changes the combination {combination} of the equations, which is not zero."
             if names
             else f"The search over {unknowns} ends where its equations have a residual."
         )

@@ -174,9 +174,9 @@ def _idle(
     block_of_row[coarse.row_of_column] = block
     links = pattern.tocoo()
     from_block, to_block = block[links.col], block_of_row[links.row]
-    seen = np.zeros(count, dtype=bool)
-    seen[block[np.unique(c.indices)]] = True
-    seen = _spread(seen, to_block, from_block)
+    measured = np.zeros(count, dtype=bool)
+    measured[block[np.unique(c.indices)]] = True
+    measured = _spread(measured, to_block, from_block)
     moving = e.tocoo()
     inside = block_of_row[moving.row] == block[moving.col]
     differentiated = np.zeros(len(columns), dtype=bool)
@@ -184,8 +184,8 @@ def _idle(
     # What an idle block needs that is not known without differentiating makes it unknown as well.
     unknown = np.zeros(count, dtype=bool)
     unknown[block_of_row[moving.row[~differentiated[moving.col]]]] = True
-    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~seen)] = True
-    unknown = _spread(unknown & ~seen, from_block, to_block, within=~seen) & ~seen
+    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~measured)] = True
+    unknown = _spread(unknown & ~measured, from_block, to_block, within=~measured) & ~measured
     idle = np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
     nothing = np.zeros(0, dtype=np.int64)
     return idle if _solvable(plant, rows[idle[0]], columns[idle[1]]) else (nothing, nothing)

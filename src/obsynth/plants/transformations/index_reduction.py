@@ -200,8 +200,8 @@ def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
         orders.append(nearest_doubles(nilpotent * term))
     others = (dynamic, states, differentiated, c * differentiated)
     chosen = tuple(int(row) for row in pivot_columns(dynamic.transpose()))
-    a, b, seen, through, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
-    return _Split(a, b, seen, through, v, x, later, outputs, tuple(orders), chosen, exact)
+    a, b, seen, d, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
+    return _Split(a, b, seen, d, v, x, later, outputs, tuple(orders), chosen, exact)
 
 
 def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | None:

@@ -178,9 +178,9 @@ def _of_matrices(
     spread = np.array([*sizes, *(size for size, _ in offsets.values()), *np.ones(len(loads))])
     kept_noise = np.eye(own.nw, new.nw)
     recovery = unchanged_states(plant, new, from_state=np.eye(nx, nx + count), noise_kept=kept_noise)
-    told = f"appended {', '.join(names)} as states" if names else ""
+    description = f"appended {', '.join(names)} as states" if names else ""
     options = {"initial_covariance": np.diag(np.concatenate([np.ones(nx), spread**2]))} if names else {}
-    return Transformation(plant, new, told, recovery), options
+    return Transformation(plant, new, description, recovery), options
 
 
 def _columns_of(

@@ -133,8 +133,8 @@ def nonlinear_terms(model: DAEModel, *, faults: Sequence[str] | None = None) -> 
         expression = equation_of(text, f"equations.{name}")
         rates = {key: _rate(inner, known, registry, model, name) for key, inner in expression.rates.items()}
         rows.append(registry.form(expression, {**known, **rates}, f"equations.{name}"))
-    seen = [registry.form(parse_expression(text), known, f"outputs.{name}") for name, text in model.outputs.items()]
-    return _assembled(model, chosen, registry, rows, seen)
+    outputs = [registry.form(parse_expression(text), known, f"outputs.{name}") for name, text in model.outputs.items()]
+    return _assembled(model, chosen, registry, rows, outputs)
 
 
 def linear_combination(text: str, known: Sequence[str], path: str) -> tuple[LinearCombination, Fraction, Fraction]:

@@ -127,9 +127,9 @@ def _region(
     lacking = [name for name in signals if name not in region]
     unknown = [name for name in region if name not in signals]
     if lacking or unknown:
-        told = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(unknown)} is none of them"
+        problem = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(unknown)} is none of them"
         raise SpecError(
-            f"region must give [low, high] of each of {', '.join(signals)}, in their units: {told}.",
+            f"region must give [low, high] of each of {', '.join(signals)}, in their units: {problem}.",
             path="method.options.region",
         )
     point = dict(zip(signals, _point(model, linear, signals), strict=True))
@@ -181,7 +181,7 @@ def _remainders(
     still = {key: zero for expression in parsed for key in expression.rates}
     left = [zero.lifted(expression.translated({**known, **still}, translation)) for expression in parsed]
     seen_texts: Any = model.outputs
-    seen = [
+    output_values = [
         zero.lifted(equation_of(text, f"outputs.{name}").translated(known, translation))
         for name, text in seen_texts.items()
     ]
@@ -191,7 +191,7 @@ def _remainders(
     shown = np.array([linear.operating_point.get(name, 0.0) for name in linear.output_names])
     equations = [_missed(-value, row, 0.0, middles, halves) for value, row in zip(left, into, strict=True)]
     rates = [COEFFICIENT_ROUNDINGS * UNIT_ROUNDOFF * value.magnitude for value in left]
-    outputs = [_missed(value, row, y, middles, halves) for value, row, y in zip(seen, out, shown, strict=True)]
+    outputs = [_missed(value, row, y, middles, halves) for value, row, y in zip(output_values, out, shown, strict=True)]
     return np.array(equations) + np.array(rates), np.array(outputs)
 
 
@@ -226,10 +226,10 @@ def _sampled(
     inside = inside + _moving(reduced["A"], reduced["Bd"][:, nd:].magnitude @ equations, step)
     through = affine_block([[reduced["D"], reduced["Df"], reduced["Dd"][:, :nd]]])
     direct = np.hstack([shipped.D, shipped.Df, shipped.Dd[:, :nd]])
-    seen = _away(reduced["C"], shipped.C) @ states + _away(through, direct) @ known
-    seen = seen + reduced["Dd"][:, nd:].magnitude @ equations + outputs
+    output_bounds = _away(reduced["C"], shipped.C) @ states + _away(through, direct) @ known
+    output_bounds = output_bounds + reduced["Dd"][:, nd:].magnitude @ equations + outputs
     terms = 4 * (nx + nu + nf + nd + 4)
-    bounds = np.concatenate([rounded_up(inside, terms), rounded_up(seen, terms)])
+    bounds = np.concatenate([rounded_up(inside, terms), rounded_up(output_bounds, terms)])
     return dict(zip(remainder_names(shipped), bounds.tolist(), strict=True))
 
 

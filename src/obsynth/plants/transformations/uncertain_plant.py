@@ -157,12 +157,12 @@ def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     _, values, right = np.linalg.svd(rows, full_matrices=False)
     rank = int(np.sum(values > UNTOUCHED_SHARE * values[0]))
     basis = right[:rank]
-    seen = np.flatnonzero(np.abs(basis).max(axis=0) > UNTOUCHED_SHARE)
-    if rank == len(seen):
+    reached = np.flatnonzero(np.abs(basis).max(axis=0) > UNTOUCHED_SHARE)
+    if rank == len(reached):
         return np.eye(n)
-    weights = moved[seen] / max(float(moved.max()), np.finfo(np.float64).tiny) + UNTOUCHED_SHARE
-    pivots = seen[dgeqp3(basis[:, seen] * weights)[1][:rank] - 1]
-    free = [j for j in seen.tolist() if j not in set(pivots.tolist())]
+    weights = moved[reached] / max(float(moved.max()), np.finfo(np.float64).tiny) + UNTOUCHED_SHARE
+    pivots = reached[dgeqp3(basis[:, reached] * weights)[1][:rank] - 1]
+    free = [j for j in reached.tolist() if j not in set(pivots.tolist())]
     coordinates = np.eye(n)
     inside = np.round(np.linalg.solve(basis[:, pivots], basis[:, free]), COORDINATE_DIGITS)
     coordinates[np.ix_(pivots, free)] = -inside
@@ -213,8 +213,8 @@ def reduced_matrices(
         changed = a[inner, keep] + a[inner, inner] @ middle
         more = -(affine_inverse(a[inner, inner]) @ changed)
         top = top + a[state, inner] @ middle + a[state, inner] @ more
-        seen = matrices["C"] @ algebraic
-        outputs = outputs + seen @ middle + seen @ more
+        algebraic_outputs = matrices["C"] @ algebraic
+        outputs = outputs + algebraic_outputs @ middle + algebraic_outputs @ more
     back = 2.0 * np.eye(nd) - v
     if divided_by is None:
         top = (affine_inverse((e @ dynamic)[state, :]) @ top).after(back)

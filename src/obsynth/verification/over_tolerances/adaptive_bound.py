@@ -223,20 +223,20 @@ def _start_table(
 
 def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = True) -> FloatArray:
     """Return what disturbances and noise add to channels and outputs, over the whole box (or the tolerances alone)."""
-    given, (inner, state, outputs) = structure.disturbances, structure.rows
+    disturbances, (inner, state, outputs) = structure.disturbances, structure.rows
 
     def total(left: FloatArray, direct: AffineMatrix) -> FloatArray:
-        gains = responses.gain(left, given.center[inner], direct.center) * float(center)
-        for part, at_once in zip(given.parts, direct.parts, strict=True):
+        gains = responses.gain(left, disturbances.center[inner], direct.center) * float(center)
+        for part, at_once in zip(disturbances.parts, direct.parts, strict=True):
             if part.any():
                 gains = gains + responses.gain(left, part[inner], at_once)
-        if given.radius.any():
-            gains = gains + responses.absolute_gain(left, given.radius[inner]) + direct.radius
+        if disturbances.radius.any():
+            gains = gains + responses.absolute_gain(left, disturbances.radius[inner]) + direct.radius
         return np.asarray(gains @ structure.bounds * OUTWARD)
 
     rows = structure.channel_rows
-    channels = total(rows @ structure.Cx, given[state, :].after(rows))
-    return np.concatenate([structure.channel_sizes(channels), total(structure.Co, given[outputs, :])])
+    channels = total(rows @ structure.Cx, disturbances[state, :].after(rows))
+    return np.concatenate([structure.channel_sizes(channels), total(structure.Co, disturbances[outputs, :])])
 
 
 def _rounding(

@@ -177,12 +177,12 @@ def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Fir
     for k in range(count):
         psi[:, k] = now
         now = (now.reshape(-1, nz) @ turned).reshape(runs, p, nz) + w[:, k, :, :nz]
-    seen = (psi.reshape(-1, nz) @ bound.shown.T).reshape(runs, count, p, rows + no)
-    seen += w[..., nz:]
-    sizes, offsets = np.abs(seen), bound.structure.offsets
+    responses = (psi.reshape(-1, nz) @ bound.shown.T).reshape(runs, count, p, rows + no)
+    responses += w[..., nz:]
+    sizes, offsets = np.abs(responses), bound.structure.offsets
     moved, shift = sizes[..., :rows].sum(axis=-2), np.zeros((runs, count, no))
     if offsets.any():
-        middle = offsets @ seen
+        middle = offsets @ responses
         moved, shift = moved + np.abs(middle[..., :rows]), -middle[..., rows:]
     return state._replace(psi=now), moved, sizes[..., rows:], shift
 

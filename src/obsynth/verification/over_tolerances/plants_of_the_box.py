@@ -113,7 +113,7 @@ def _peak_gain(
     back = 2.0 * np.eye(len(basis)) - basis
     into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
     through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
-    seen = np.vstack([back @ smooth.A, into, through])
+    rows = np.vstack([back @ smooth.A, into, through])
     terms = np.concatenate(
         [
             np.abs(back @ smooth.A).sum(axis=1),
@@ -121,14 +121,17 @@ def _peak_gain(
             (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
         ]
     )
-    apart = untouched_states(seen @ basis, terms)
-    kept = [i for i in range(smooth.nx) if i not in apart]
-    nx, nz = len(kept), observer.order
+    apart = untouched_states(rows @ basis, terms)
+    states = [i for i in range(smooth.nx) if i not in apart]
+    nx, nz = len(states), observer.order
     a = np.block(
-        [[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))], [(into @ basis)[:, kept], observer.Az]]
+        [
+            [(back @ smooth.A @ basis)[np.ix_(states, states)], np.zeros((nx, nz))],
+            [(into @ basis)[:, states], observer.Az],
+        ]
     )
-    b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
-    c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
+    b = np.vstack([(back @ smooth.Bd)[states], observer.By @ smooth.Dd - followed @ smooth.Bd])
+    c = np.hstack([(through @ basis)[:, states], observer.Cz[shown]])
     total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
     if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
         return np.full(len(c), np.inf)
