@@ -248,13 +248,7 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
         return Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
     reason: object = ""
     for noise in noises:
-        B, D = problem.B, problem.D
-        if noise:
-            B, D = np.hstack([B, np.zeros((n, rows))]), np.hstack([D, noise * size * np.eye(rows)])
-        if noise and not problem.B.any() and not problem.D.any():
-            # Without any noise, modes that last are forgotten as fast as they are seen.
-            output_size = max(float(np.linalg.norm(problem.C)), SMALLEST)
-            B, D = np.hstack([B, noise * size / output_size * np.eye(n)]), np.hstack([D, np.zeros((rows, n))])
+        B, D = _noisy(problem, noise * size)
         try:
             _, K, R = _kalman(replace(problem, B=B, D=D))
         except (np.linalg.LinAlgError, ValueError) as error:
@@ -279,6 +273,23 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
         f"outputs shows a mode that lasts: no stable filter has this fault map ({reason}).",
         condition="zeros",
     )
+
+
+def _noisy(problem: EstimationProblem, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Return B and D with noise of some size on each output; of a problem without any noise on each state as well.
+
+    Its lasting modes are then forgotten as fast as they are seen.  Where a problem has noise, and none on lasting
+    modes, it is for the caller to drive these: in its own plant, whose claims stay those of the plant as it is.
+    """
+    B, D = problem.B, problem.D
+    if not noise:
+        return B, D
+    n, rows = len(problem.A), len(problem.C)
+    B, D = np.hstack([B, np.zeros((n, rows))]), np.hstack([D, noise * np.eye(rows)])
+    if not problem.B.any() and not problem.D.any():
+        output_size = max(float(np.linalg.norm(problem.C)), SMALLEST)
+        B, D = np.hstack([B, noise / output_size * np.eye(n)]), np.hstack([D, np.zeros((rows, n))])
+    return B, D
 
 
 def _central(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, FloatArray]:

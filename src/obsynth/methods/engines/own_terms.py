@@ -67,19 +67,9 @@ def filter_by_inequality(
     free = bool(method.asks_for_free_weight)
     problem = wang2015(plant, S=method.S, W="free" if free else method.given_weight, gamma=None)
     squared, P, Y = problem.variables["gamma_squared"], problem.variables["P"], problem.variables["Y"]
-    parts = [] if method.region is None else [checked_region(method.region)]
-    if method.decay is not None:
-        parts.append(disk(0.0, float(np.exp(-method.decay * plant.dt))))
-    where = None if not parts else parts[0] if len(parts) == 1 else parts[0] & parts[1]
+    where = _filter_region(method, plant.dt)
     added: dict[str, Any] = {}
     if where is not None:
-        if not where.contains([0.0]):
-            raise PreconditionError(
-                f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
-                "region with 0 in it.",
-                condition="region",
-                mode=0j,
-            )
         added["region"] = atoms.region(problem.data["A1"], P, where, Y=Y, Cy=problem.data["C1"], margin=lmi.MARGIN)[1]
     if method.gamma is not None:
         added["gamma"] = squared <= method.gamma**2
@@ -106,11 +96,35 @@ def filter_by_inequality(
     gains = problem.gains()
     work = with_sensor_faults_as_states(plant)
     _require_inside(gains["T"] @ work.A - gains["L"] @ work.C, where)
+    progress("building the realisation and its certificate")
+    made = _realised_filter(plant, method, gains)
+    return _recorded(made, method, problem, runs, where, weight=method.taken_weight(free=free))
+
+
+def _filter_region(method: FaultEstimationFilter, dt: float) -> LMIRegion | None:
+    """Return where the eigenvalues shall be: in the region that is asked for, and fast enough."""
+    regions = [] if method.region is None else [checked_region(method.region)]
+    if method.decay is not None:
+        regions.append(disk(0.0, float(np.exp(-method.decay * dt))))
+    where = None if not regions else regions[0] if len(regions) == 1 else regions[0] & regions[1]
+    if where is not None and not where.contains([0.0]):
+        raise PreconditionError(
+            f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
+            "region with 0 in it.",
+            condition="region",
+            mode=0j,
+        )
+    return where
+
+
+def _realised_filter(
+    plant: DescriptorSystem, method: FaultEstimationFilter, gains: Mapping[str, FloatArray]
+) -> Synthesis:
+    """Return the filter of gains, with the gain that it claims, and the mean of its estimates."""
     gamma = None
     if plant.nd:
         gamma = (1.0 + CLAIM_ROOM) * error_norm(plant, gains)
         gamma = method.gamma if method.gamma is not None and method.gamma > gamma else gamma
-    progress("building the realisation and its certificate")
     letters: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
     made = filter_from_gains(plant, **letters, gamma=gamma, indexes=None)
     if method.mean > 1 and isinstance(made.observer, LinearObserver):
@@ -118,7 +132,7 @@ def filter_by_inequality(
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
         made = replace(made, observer=averaged(made.observer, method.mean), certificate=Certificate(matrices, claims))
-    return _recorded(made, method, problem, runs, where, weight=method.taken_weight(free=free))
+    return made
 
 
 def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:

@@ -252,24 +252,14 @@ def linear_model(
     inputs, B = [model.input_names[i] for i in known], -local.by_input[:, known]
     if motion is not None:
         inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
-    # A state must not have the name of an output with another value.
-    shown = dict(zip(model.output_names, local.y, strict=True))
-    names = [
-        name if shown.get(name, x) == x else f"{name} (state)"
-        for name, x in zip(model.state_names, point.x, strict=True)
-    ]
-    values = dict(
-        zip(
-            (*model.parameter_names, *model.input_names, *names, *model.output_names),
-            map(float, (*point.theta, *point.u, *point.x, *local.y)),
-            strict=True,
-        )
-    )
-    values |= {} if motion is None else {DRIFT: 0.0}
+    names = _state_names(model, point, local)
+    values = _values_at(model, point, local, names) | ({} if motion is None else {DRIFT: 0.0})
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
     units |= {
-        name: model.units[given] for name, given in zip(names, model.state_names, strict=True) if given in model.units
+        name: model.units[original]
+        for name, original in zip(names, model.state_names, strict=True)
+        if original in model.units
     }
     linear = DescriptorSystem(
         local.E,
@@ -292,6 +282,21 @@ def linear_model(
         return linear
     columns = {"B": known, "Bd": unknown, "Bf": fault_columns}
     return _over_box(linear, model, point, box, columns, moving=motion is not None)
+
+
+def _state_names(model: DAEModel, point: Point, local: LocalEquations) -> list[str]:
+    """Return the names of the states: none is that of an output with another value."""
+    outputs = dict(zip(model.output_names, local.y, strict=True))
+    return [
+        name if outputs.get(name, x) == x else f"{name} (state)"
+        for name, x in zip(model.state_names, point.x, strict=True)
+    ]
+
+
+def _values_at(model: DAEModel, point: Point, local: LocalEquations, states: Sequence[str]) -> dict[str, float]:
+    """Return the value of every signal at the point, by name."""
+    names = (*model.parameter_names, *model.input_names, *states, *model.output_names)
+    return dict(zip(names, map(float, (*point.theta, *point.u, *point.x, *local.y)), strict=True))
 
 
 def _motion(model: DAEModel, point: Point, local: LocalEquations, *, drift: bool) -> FloatArray | None:
