@@ -86,7 +86,7 @@ def lives(spec: Path) -> tuple[obsynth.ObserverDesign, pd.DataFrame, pd.DataFram
     return obsynth.load("gains.json"), pd.read_csv("simulated.csv"), pd.read_csv("estimates.csv")
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(9)
 @pytest.mark.parametrize("name", PAPERS_AND_NETWORKS)
 def test_a_design_has_the_same_life_whatever_its_method(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -11,10 +12,20 @@ from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 import obsynth
 
 SOURCE = Path(obsynth.__file__).parent
 ROOT, COMMANDS = "obsynth", "obsynth.cli"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_rubbish() -> Iterator[None]:
+    """No rubbish is looked for among the nodes of the sources, which takes as long as reading them."""
+    gc.disable()
+    yield
+    gc.enable()
 
 
 def module_name(path: Path) -> str:

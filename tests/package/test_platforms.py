@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -24,6 +25,14 @@ UNIX_NAMES = {
 }  # fmt: skip
 #: Types that are of other sizes elsewhere; on Windows and on Apple's ARM a long double is a double.
 SIZES = {"longdouble", "clongdouble", "float96", "float128", "complex256", "int_", "uint", "long", "ulong"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_rubbish() -> Iterator[None]:
+    """No rubbish is looked for among the nodes of the sources, which takes as long as reading them."""
+    gc.disable()
+    yield
+    gc.enable()
 
 
 Nodes = Sequence[ast.AST]
