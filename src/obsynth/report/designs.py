@@ -141,11 +141,11 @@ def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
         return []
     names = [name for name in observer.fault_names if name in plant.fault_names][:MOST_CURVES]
     rates = design.options.get("fault_rate")
-    found = []
+    curves = []
     for name in names:
         rate = rates.get(name) if isinstance(rates, Mapping) else rates
-        found.append(delay_curve(plant, plant.fault_names.index(name), rate))
-    return [curve for curve in found if curve is not None]
+        curves.append(delay_curve(plant, plant.fault_names.index(name), rate))
+    return [curve for curve in curves if curve is not None]
 
 
 def delay_table(curve: DelayCurve) -> Table:
@@ -279,7 +279,7 @@ def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
     figures = fault_figures(sampled, clocked, steps)
     if plant.dt == 0.0:
         figures = _closely_timed(plant, observer, figures, step)
-    return {found.fault: found for found in figures}
+    return {fault_step.fault: fault_step for fault_step in figures}
 
 
 def _closely_timed(
@@ -288,7 +288,7 @@ def _closely_timed(
     """Return figures whose times to 90 % are known to one in `SETTLING_SAMPLES`: the plant's settling time, by which
     they were sampled, may be long beside these."""
     for _ in range(MOST_CLOSER_LOOKS):
-        coarse = [found.most for found in figures if found.reaches and 0.0 < found.most < SETTLING_SAMPLES * step]
+        coarse = [figure.most for figure in figures if figure.reaches and 0.0 < figure.most < SETTLING_SAMPLES * step]
         if not coarse:
             break
         # The straight lines between samples may show a step by up to two of these too soon.
@@ -299,8 +299,8 @@ def _closely_timed(
         except ObsynthError:
             break
         figures = tuple(
-            replace(found, most=fine.most) if math.isfinite(fine.most) else found
-            for found, fine in zip(figures, closer, strict=True)
+            replace(figure, most=fine.most) if math.isfinite(fine.most) else figure
+            for figure, fine in zip(figures, closer, strict=True)
         )
     return figures
 
@@ -331,14 +331,14 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
     unknown = ", ".join(plant.disturbance_names)
     for name in observer.fault_names if plant.nd else ():
         number = plant.fault_names.index(name)
-        beside = others(plant, number)
-        asked, among, either = decoupled_fault(plant, (), number), unknown, "either"
-        if asked.shows_at(rest):
-            if not beside or decoupled_fault(plant, beside, number).shows_at(rest):
+        other_faults = others(plant, number)
+        decoupled, among, either = decoupled_fault(plant, (), number), unknown, "either"
+        if decoupled.shows_at(rest):
+            if not other_faults or decoupled_fault(plant, other_faults, number).shows_at(rest):
                 continue
-            among = f"{unknown} and {', '.join(plant.fault_names[i] for i in beside)} together"
+            among = f"{unknown} and {', '.join(plant.fault_names[i] for i in other_faults)} together"
             either = "any of them"
-        what = f"A constant {name}" if asked.visible else name
+        what = f"A constant {name}" if decoupled.visible else name
         yield (
             f"{what} cannot be distinguished from {among}: the estimate may be an effect of {either}. See obsynth "
             "check for the sensors that would distinguish them."

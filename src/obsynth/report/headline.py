@@ -69,8 +69,10 @@ def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
 def _of_run(run: DataRun) -> str:
     if not run.events:
         if not (run.statement or run.thresholds):
-            told = f"{run.rows} rows, and no rule for alarms: nothing is decided. Give one by --threshold or --monitor."
-            return f'<p class="verdict undecided">{told}</p>'
+            sentence = (
+                f"{run.rows} rows, and no rule for alarms: nothing is decided. Give one by --threshold or --monitor."
+            )
+            return f'<p class="verdict undecided">{sentence}</p>'
         return f'<p class="verdict holds">No alarm in {run.rows} rows.</p>'
     first = run.events[0]
     named = f" Probable fault: {first.fault}." if first.clear else ""
@@ -103,23 +105,23 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
     steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""
-        told = f"{name}: "
+        sentence = f"{name}: "
         deviation = figures["deviation"]
         if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
-            told += (
+            sentence += (
                 f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise} (false "
                 f"alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
             )
         else:
-            told += "no sensor noise is stated, so that no smallest size is known"
-        found = steps.get(name)
-        if found is not None and found.reaches:
-            told += f"; 90 % of a step is reached after {duration(found.most)}"
+            sentence += "no sensor noise is stated, so that no smallest size is known"
+        followed_step = steps.get(name)
+        if followed_step is not None and followed_step.reaches:
+            sentence += f"; 90 % of a step is reached after {duration(followed_step.most)}"
         elif figures["delay"]:
-            told += f"; delay {duration(figures['delay_seconds'])}"
+            sentence += f"; delay {duration(figures['delay_seconds'])}"
         if gain := figures.get("largest_gain", 0.0):
-            told += f"; {figures['largest_gain_from']} of 1 moves the estimate by up to {number(gain, digits=3)}"
-        yield f"{told}."
+            sentence += f"; {figures['largest_gain_from']} of 1 moves the estimate by up to {number(gain, digits=3)}"
+        yield f"{sentence}."
 
 
 def _size(value: float, unit: str) -> str:

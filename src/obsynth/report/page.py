@@ -161,8 +161,8 @@ def _zooms(design: ObserverDesign, scenario: Scenario | None, run: DataRun | Non
     """Yield plots of the log, or of the simulation where there is none."""
     if run is not None:
         yield from run_plots(run, design.plant.units)
-    elif _fits(design) and (found := shown_simulation(design, scenario)) is not None:
-        yield from simulation_plots(found[1], design.plant.units)
+    elif _fits(design) and (demonstration := shown_simulation(design, scenario)) is not None:
+        yield from simulation_plots(demonstration[1], design.plant.units)
 
 
 def _anchor(heading: str) -> str:

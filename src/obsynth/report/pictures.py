@@ -132,10 +132,10 @@ def shown_simulation(design: ObserverDesign, scenario: Scenario | None) -> tuple
 
 def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
     """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
-    found, given = shown_simulation(design, scenario), scenario is not None
-    if found is None:
+    demonstration, given = shown_simulation(design, scenario), scenario is not None
+    if demonstration is None:
         return
-    shown, simulation = found
+    shown, simulation = demonstration
     linear = isinstance(design.observer, LinearObserver)
     what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
     text = f"{what}: {_story(shown, given=given, linear=linear)}"

@@ -190,21 +190,21 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
     for method, report in methods.items():
         failed = report.failures
         names = {check.name for check in failed}
-        asked = " (the spec's method)" if method == own else ""
+        own_method = " (the spec's method)" if method == own else ""
         if report.passed:
-            yield method, f"all conditions hold, so a design exists{asked}", "green"
+            yield method, f"all conditions hold, so a design exists{own_method}", "green"
         elif _PLANT_KIND in names and method != own:
             others.append(method)
         elif names & set(_TIME_CONDITIONS):
-            yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + asked, "yellow"
+            yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + own_method, "yellow"
         elif _OF_THIS_KIND in names:
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
-            yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
+            yield method, f"not for this plant{own_method}: {reason}".rstrip("."), "yellow"
         elif names & _ASKED:
             reason = " ".join(check.detail for check in failed if check.name in _ASKED)
-            yield method, f"needs more options{asked}: {reason}".rstrip("."), "yellow"
+            yield method, f"needs more options{own_method}: {reason}".rstrip("."), "yellow"
         else:
-            yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
+            yield method, f"{_verdict(failed)} for this plant{own_method}: {_reason(failed)}", "bold red"
     if others:
         yield "for other kinds of plants", ", ".join(others), "dim"
 
@@ -223,9 +223,11 @@ def _reason(failed: Sequence[Check]) -> str:
     if not failed:
         return "no condition was checked"
     first, *more = failed
-    told = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
-    told += f". Found: {first.detail}".rstrip(".") if first.detail else ""
-    return f"{told}." + (f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else "")
+    sentence = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
+    sentence += f". Found: {first.detail}".rstrip(".") if first.detail else ""
+    return f"{sentence}." + (
+        f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else ""
+    )
 
 
 def linear_plant_text(plant: DescriptorSystem) -> str:

@@ -58,12 +58,12 @@ def simulation_report(
                 number(0.0 if row["largest"] <= rounding[signal] else row[key]) for key in ("rmse", "largest")
             )
             table.add_row(Text(signal), rmse, largest, last, Text(units.get(signal, "")))
-        told = "errors of the whole record"
+        remark = "errors of the whole record"
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
-            told = "the initial-condition response has not settled: errors of the whole record"
+            remark = "the initial-condition response has not settled: errors of the whole record"
         elif linear:
-            told = f"errors from {duration(end)} on, when the start no longer shows"
-        print_section(console, f"{title} ({told})", table)
+            remark = f"errors from {duration(end)} on, when the start no longer shows"
+        print_section(console, f"{title} ({remark})", table)
     for note in summary["notes"]:
         console.print(Text(note))
     if file is not None:

@@ -159,9 +159,9 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     )
 
 
-def print_summary(found: Summary, *, console: Console) -> None:
+def print_summary(shown_summary: Summary, *, console: Console) -> None:
     """Print a summary; a file's name stays in one piece, so that it can be copied."""
-    for text, style in found.lines(min(console.width, 120)):
+    for text, style in shown_summary.lines(min(console.width, 120)):
         console.print(Text(text, style=style), soft_wrap=True)
 
 
@@ -187,8 +187,8 @@ def _is_open_about_constant_faults(design: ObserverDesign) -> bool:
 
 def _beside_the_least(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     """Yield how near a design is to the least that any causal filter with its response to the faults lets through."""
-    found = least_possible(design, later=True) if design.method in REGISTRY else None
-    if found is not None and (text := found.sentence()):
+    least = least_possible(design, later=True) if design.method in REGISTRY else None
+    if least is not None and (text := least.sentence()):
         yield "least", text
 
 
@@ -275,13 +275,13 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
         return
     observer = design.linear[1]
     late = dict(zip(observer.fault_names, observer.fault_delays, strict=True))
-    reached = [(name, found.most) for name, found in steps.items() if found.reaches]
+    reached = [(name, step_figures.most) for name, step_figures in steps.items() if step_figures.reaches]
     digits = 4 if observer.dt > 0.0 else 3
-    told = [
+    slow_steps = [
         f"{name} {number(most, digits=digits)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt
     ]
-    if told:
-        yield "step", f"the estimate reaches 90 % after: {listed(told, most=_MOST_IN_SUMMARY)}"
+    if slow_steps:
+        yield "step", f"the estimate reaches 90 % after: {listed(slow_steps, most=_MOST_IN_SUMMARY)}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
@@ -331,7 +331,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
         return
     plant, observer = design.linear
     units = plant.units
-    told = []
+    not_followed = []
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
             gain = float(gains.disturbance_gains[i, j])
@@ -343,9 +343,9 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
             share = f"{round(100.0 * followed)} %" if abs(followed) <= FAR_FROM_ONE else "many times the size"
-            told.append(fault)
+            not_followed.append(fault)
             yield f"the estimate of {fault} does not follow a step: its steady state is {share} of it."
-    yield from design_warnings(design, steps, told=told)
+    yield from design_warnings(design, steps, told=not_followed)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             place = check.name.removeprefix("limit at ")

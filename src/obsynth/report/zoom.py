@@ -48,7 +48,7 @@ def zoomable(
     """
     signals = [np.asarray(line[2], dtype=np.float64) for line in lines]
     columns = _thinned([np.asarray(time, dtype=np.float64), *signals])
-    told = {
+    plot = {
         "label": label,
         "across": "time" if dated else "time (s)",
         "dated": dated,
@@ -58,7 +58,7 @@ def zoomable(
     }
     return (
         f'<details class="zoom"><summary>{escape(label)}</summary>'
-        f'<div class="plot" data-plot="{escape(json.dumps(told, allow_nan=False), quote=True)}"></div></details>'
+        f'<div class="plot" data-plot="{escape(json.dumps(plot, allow_nan=False), quote=True)}"></div></details>'
     )
 
 

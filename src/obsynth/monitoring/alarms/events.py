@@ -248,8 +248,8 @@ def alarm_rows(events: Sequence[AlarmEvent], date_of: Callable[[float], str]) ->
         ends = date_of(event.start), date_of(event.end)
         fault = fault_text(event, date_of)
         rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
-    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
-    return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
+    nonempty = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
+    return [tuple(row[i] for i in nonempty) for row in rows], len(events) - len(rows) + 1
 
 
 def fault_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:

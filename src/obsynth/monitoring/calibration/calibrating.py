@@ -203,31 +203,18 @@ def calibrate(
     >>> for u in inflow[1:]:
     ...     level.append((level[-1] + u) / (1 + 0.5))  # backward Euler with c = 0.5
     >>> log = {"time": k, "inflow": inflow, "gauge": np.array(level) + 0.01 * rng.normal(size=200)}
-    >>> found = obsynth.calibrate(tank, log, {"c": (0.1, 1.0)})
-    >>> round(found.nominal["c"], 2)
+    >>> calibration = obsynth.calibrate(tank, log, {"c": (0.1, 1.0)})
+    >>> round(calibration.nominal["c"], 2)
     0.5
     """
-    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
-        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    _require_numbers(level, input_delay)
     starts = whole_number(starts, "starts")
-    if input_delay != "auto" and not is_whole(input_delay):
-        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
     note = progress or (lambda text: None)
     model = _loads_as_parameters(require_plant(model), walks)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
-    record = read_log(
-        log,
-        model.input_names,
-        model.output_names,
-        rows=rows,
-        columns=columns,
-        scales=factors,
-        dt=_sample_time(model, dt, substeps),
-    )
-    digest = record.digest
-    record = record.unstuck()
-    record = record.without(wrong_samples(record.y))
-    record = record.shifted(input_delay) if isinstance(input_delay, int) else record
+    seconds = _sample_time(model, dt, substeps)
+    read = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=factors, dt=seconds)
+    record = _usable(read, input_delay)
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, record)
     noise_model = asked_states(sensor_noise, offset, walks, model.output_names)
 
@@ -270,8 +257,29 @@ def calibrate(
     if offset is None:
         fitted = fitting.with_unseen_offsets(fitted)
     return reported(
-        fitted.problem, fitted.fits[0], fitted.fit, level=level, losses=fitted.losses, error=fitted.error, digest=digest
+        fitted.problem,
+        fitted.fits[0],
+        fitted.fit,
+        level=level,
+        losses=fitted.losses,
+        error=fitted.error,
+        digest=read.digest,
     )
+
+
+def _require_numbers(level: Any, input_delay: Any) -> None:
+    """Raise `SpecError` where the level is no probability, or the delay of the inputs no whole number of rows."""
+    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
+        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    if input_delay != "auto" and not is_whole(input_delay):
+        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
+
+
+def _usable(record: RecordedLog, input_delay: int | str) -> RecordedLog:
+    """Return a log without samples of stuck sensors and wrong ones, its inputs shifted by a delay that is known."""
+    record = record.unstuck()
+    record = record.without(wrong_samples(record.y))
+    return record.shifted(input_delay) if isinstance(input_delay, int) else record
 
 
 def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:

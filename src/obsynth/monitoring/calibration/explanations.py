@@ -57,10 +57,10 @@ def explanations(
         text = f"a constant {name} near {nearer:.3g} instead of {value:.3g}"
         values[text] = (name, nearer)
         candidates.append((text, gain))
-    kept = sorted((item for item in candidates if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
+    clear = sorted((item for item in candidates if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
     tried = [
         (text, _of_run(innovations, with_constant(*values[text])) if text in values else gain)
-        for text, gain in kept[:MOST_TOLD]
+        for text, gain in clear[:MOST_TOLD]
     ]
     return tuple(sorted((item for item in tried if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1]))
 

@@ -104,8 +104,8 @@ class Objective:
 
     def free_of(self, v: FloatArray) -> FloatArray:
         """Return free variables from ``[t, log q, log r]``."""
-        whole = np.concatenate([v[: self.nt] / self.problem.widths, v[self.nt :]])
-        return np.asarray(np.clip(whole[self.free], self.low, self.high))
+        scaled = np.concatenate([v[: self.nt] / self.problem.widths, v[self.nt :]])
+        return np.asarray(np.clip(scaled[self.free], self.low, self.high))
 
     def full(self, z: FloatArray) -> FloatArray:
         """Return ``[t, log q, log r]``."""

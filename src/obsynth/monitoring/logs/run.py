@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -289,29 +289,43 @@ def run_on_data(
         resume_state(Path(str(state)), run, digest)
     data = data if isinstance(data, str | Path) or hasattr(data, "readline") else as_frame(data)
     room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
-    kept = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
+    measured = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), run, digest)
-    # A log that is followed begins with the rows that the state has, and may have had many.
-    after = run.clock.stamp if resumed and isinstance(data, FollowedLog) else None
-    rows = chunks(data, run.signals, stamps, chunk_rows, after=after)
-    if not hasattr(data, "readline"):
-        # What cannot be read leaves no header behind; of a stream the header comes before the first row.
-        rows = chain(list(islice(rows, 1)), rows)
-    gathered = FrameSink(run.header, stamps, room)
+    rows = _rows_to_run(data, run, stamps, chunk_rows, resumed=resumed)
+    estimates = FrameSink(run.header, stamps, room)
     for file in (out, state):
         if isinstance(file, str | Path):
             remove_left_parts(Path(file))
-    with nullcontext(gathered) if out is None else sink_for(out, run.header, stamps) as sink:
-        _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
+    with nullcontext(estimates) if out is None else sink_for(out, run.header, stamps) as sink:
+        _run_rows(run, rows, sink, measured, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
             _require_a_window(design, run.rows)
     if state is not None:
         save_state(Path(state), run, digest)
-    table = gathered.frame() if out is None else None
-    recovered_flags = {} if run.recovered is None else dict(run.recovered.flags)
+    return replace(
+        _summary_of(run, design, digest, stamps, resumed=resumed),
+        table=estimates.frame() if out is None else None,
+        measured=None if measured is None else measured.frame(),
+        thresholds=dict(thresholds or {}),
+        statement="" if monitor is None else monitor.statement,
+    )
+
+
+def _rows_to_run(data: Data, run: LogRun, stamps: Stamps, chunk_rows: int, *, resumed: bool) -> Iterator[FloatArray]:
+    """Return the rows of a log in chunks; those of a file are begun to be read, so that a header is only written where
+    they can be."""
+    # A log that is followed begins with the rows that the state has, and may have had many.
+    after = run.clock.stamp if resumed and isinstance(data, FollowedLog) else None
+    rows = chunks(data, run.signals, stamps, chunk_rows, after=after)
+    # Of a stream the header comes before the first row.
+    return rows if hasattr(data, "readline") else chain(list(islice(rows, 1)), rows)
+
+
+def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps, *, resumed: bool) -> DataRun:
+    """Return what happened in a run that has ended: counts of rows, alarms, outliers, stuck sensors and warnings."""
     runs_by_output = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
     stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in runs_by_output if runs}
     start = () if resumed else run.first.alarm_of_the_start(design, run.events.events())
@@ -320,18 +334,14 @@ def run_on_data(
         statuses=dict(run.statuses),
         alarms=dict(run.alarms),
         isolated=run.isolated,
-        recovered=recovered_flags,
+        recovered={} if run.recovered is None else dict(run.recovered.flags),
         outliers=dict(getattr(run.observer, "outliers", {})),
         warnings=(*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *start, *stuck_texts(stuck)),
         digest=digest,
-        table=table,
-        measured=None if kept is None else kept.frame(),
         stamps=stamps,
-        thresholds=dict(thresholds or {}),
         alarm_rows=dict(run.alarm_rows),
         events=run.events.events(),
         silent=dict(run.events.silent),
-        statement="" if monitor is None else monitor.statement,
         stuck=stuck,
     )
 
@@ -385,7 +395,7 @@ def _run_rows(
     run: LogRun,
     rows: Iterator[FloatArray],
     sink: Sink,
-    kept: FrameSink | None,
+    measured: FrameSink | None,
     save: Callable[[], None] | None,
     progress: Callable[[int], object],
     state_every: int = STATE_ROWS,
@@ -394,8 +404,8 @@ def _run_rows(
     held, is_whole = HeldSignals(), True
     if save is None:
         for chunk in rows:
-            if kept is not None:
-                kept.keep([chunk[:, 0].tolist(), *run.signals.measured(chunk).T], len(chunk))
+            if measured is not None:
+                measured.keep([chunk[:, 0].tolist(), *run.signals.measured(chunk).T], len(chunk))
             sink(run.take(chunk))
             progress(run.rows)
         sink(run.finish())

@@ -86,10 +86,10 @@ def _without_days(blocks: Iterator[FloatArray], stamps: Stamps) -> Iterator[Floa
         yield chunk
 
 
-def _differenced(found: Iterator[FloatArray], stamps: Stamps, *, goes_on: bool) -> Iterator[FloatArray]:
+def _differenced(blocks: Iterator[FloatArray], stamps: Stamps, *, goes_on: bool) -> Iterator[FloatArray]:
     """Yield rows with the derivatives of known inputs that no column has; ``goes_on``: after the rows of a state."""
     before = stamps.differenced if goes_on else {}
-    for chunk in found:
+    for chunk in blocks:
         latest = max((float(known[0]) for known in before.values()), default=-np.inf)
         # Rows that the clock leaves out, since they are no later than others, are no samples of the input.
         rising = chunk[:, 0] > np.fmax.accumulate(np.concatenate([[latest], chunk[:, 0]]))[:-1]
@@ -127,20 +127,20 @@ def _delayed(blocks: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) 
 def _advanced(blocks: Iterator[FloatArray], signals: LogSignals) -> Iterator[FloatArray]:
     """Yield rows with the inputs of so many rows after, for which they wait; the last ones hold the last."""
     inputs, wait = slice(1, 1 + signals.inputs), -signals.delay
-    kept: FloatArray | None = None
+    waiting: FloatArray | None = None
     for chunk in blocks:
-        joined = chunk if kept is None else np.vstack([kept, chunk])
+        joined = chunk if waiting is None else np.vstack([waiting, chunk])
         ready = max(len(joined) - wait, 0)
-        kept = joined[ready:].copy()
+        waiting = joined[ready:].copy()
         if ready:
             done = joined[:ready].copy()
             done[:, inputs] = joined[wait : wait + ready, inputs]
             yield done
-    if kept is not None and len(kept):
+    if waiting is not None and len(waiting):
         # Of a short log fewer rows than these are left.
-        after = np.minimum(np.arange(len(kept)) + wait, len(kept) - 1)
-        kept[:, inputs] = kept[after][:, inputs]
-        yield kept
+        after = np.minimum(np.arange(len(waiting)) + wait, len(waiting) - 1)
+        waiting[:, inputs] = waiting[after][:, inputs]
+        yield waiting
 
 
 def _chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:

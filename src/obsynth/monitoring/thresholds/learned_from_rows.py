@@ -34,7 +34,7 @@ from obsynth.monitoring.thresholds.parameter_scores import (
 )
 from obsynth.monitoring.thresholds.watched_columns import settling_rows, watched_names
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.autoregression import fitted_autoregression
+from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.plants.noise import offset_state
@@ -94,33 +94,17 @@ def thresholds_from_rows(
     usual = [i for i in range(len(names)) if i not in seldom]
     complete = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
     every_other = pairs.others(every)
-    count = int(complete.sum())
-    if count < LEAST_NORMAL:
-        raise SpecError(
-            f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
-            f"give {LEAST_NORMAL} and more.",
-            path="normal",
-        )
+    count = _checked_count(complete)
     conformal = is_conformal(count, every_other)
     scores = None if scores is None else _usual_scores(scores, complete)
-    if like is None:
-        candidates = [usual[i] for i in independent(rows[complete][:, usual])]
-        residuals = [usual[i] for i in varying(rows[complete][:, usual], faults)]
-        choices = [part for part in ((candidates, residuals) if scores is None else (residuals or candidates,)) if part]
-    else:
-        choices = [[names.index(name) for name in like.columns]]
-    if not choices:
-        raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
-    fits = [(kept, fitted_autoregression(np.where(complete[:, None], rows[:, kept], np.nan))) for kept in choices]
-    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count and (fit is fits[-1] or fit[1].is_regular)]
-    kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
-    x = np.where(complete[:, None], rows[:, kept], np.nan)
-    columns = tuple(names[i] for i in kept)
+    choices = _column_choices(rows[complete], names, usual, faults, like, with_scores=scores is not None)
+    chosen, model = _fitted_columns(choices, rows, complete)
+    x = np.where(complete[:, None], rows[:, chosen], np.nan)
     centres, scales = rows[complete, :faults].mean(axis=0), rows[complete, :faults].std(axis=0)
     if scores is not None:
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
     directions = (
-        signatures(design, kept, np.sqrt(np.nanvar(x, axis=0)))
+        signatures(design, chosen, np.sqrt(np.nanvar(x, axis=0)))
         if like is None
         else (like.statistics.signatures, like.statistics.told)
     )
@@ -137,7 +121,7 @@ def thresholds_from_rows(
     judged = held if validated else not_held_out(x, statistics, scores)
     levels = room * levels_of_other_parts(levels, judged, every_other)
     return LearnedThresholds(
-        columns,
+        tuple(names[i] for i in chosen),
         statistics,
         read_only(levels),
         every,
@@ -148,7 +132,7 @@ def thresholds_from_rows(
         read_only(np.where(scales > 0.0, scales, 1.0)),
         gain_set_digest(design),
         extrapolated,
-        tuple(name for i, name in enumerate(names) if i not in kept and name not in statistics.estimates),
+        tuple(name for i, name in enumerate(names) if i not in chosen and name not in statistics.estimates),
         settling_rows(design),
         pairs,
         innovation,
@@ -160,6 +144,53 @@ def thresholds_from_rows(
         healthy_time=time,
         repeats=None if repeats is None else read_only(repeats),
     )
+
+
+def _checked_count(complete: NDArray[np.bool_]) -> int:
+    """Return how many rows are complete; raise `SpecError` where they are too few."""
+    count = int(complete.sum())
+    if count < LEAST_NORMAL:
+        raise SpecError(
+            f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
+            f"give {LEAST_NORMAL} and more.",
+            path="normal",
+        )
+    return count
+
+
+def _column_choices(
+    rows: FloatArray,
+    names: Sequence[str],
+    usual: list[int],
+    faults: int,
+    like: LearnedThresholds | None,
+    *,
+    with_scores: bool,
+) -> list[list[int]]:
+    """Return sets of columns of complete rows to watch, the preferred one first: those of ``like``; else estimates and
+    residuals that are independent, then the residuals alone, which are all where scores tell of the faults."""
+    if like is not None:
+        choices = [[names.index(name) for name in like.columns]]
+    else:
+        candidates = [usual[i] for i in independent(rows[:, usual])]
+        residuals = [usual[i] for i in varying(rows[:, usual], faults)]
+        choices = [part for part in ((residuals or candidates,) if with_scores else (candidates, residuals)) if part]
+    if not choices:
+        raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
+    return choices
+
+
+def _fitted_columns(
+    choices: list[list[int]], rows: FloatArray, complete: NDArray[np.bool_]
+) -> tuple[list[int], Autoregression]:
+    """Return the first set of columns whose autoregression needs no more rows than are complete, with that model; the
+    set that needs fewest where none does."""
+    fits = [
+        (columns, fitted_autoregression(np.where(complete[:, None], rows[:, columns], np.nan))) for columns in choices
+    ]
+    count = int(complete.sum())
+    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count and (fit is fits[-1] or fit[1].is_regular)]
+    return enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
 
 
 def seldom_known(rows: FloatArray, faults: int) -> list[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,8 +137,8 @@ def learn_thresholds(
     >>> design = obsynth.fault_estimation_filter(plant)
     >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=2000, noise=1.0)).outputs
     >>> normal = pd.DataFrame({"time": range(len(log)), "y1": log[:, 0], "y2": log[:, 1]})
-    >>> found = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows")
-    >>> found.columns
+    >>> learned = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows")
+    >>> learned.columns
     ('fhat[f1]',)
     """
     # Both are refused before the log is read.
@@ -147,94 +147,115 @@ def learn_thresholds(
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
 
-    starts: FloatArray | None = None
-
-    def started(sizes: FloatArray | None = None) -> LogRun:
+    def new_run(sizes: FloatArray | None = None, starts: FloatArray | None = None) -> LogRun:
         changes = {} if sizes is None else {"outlier_sizes": sizes}
         if starts is not None:
             changes["initial_covariance"] = starts
         own = design if not changes else design.replace(observer=changed(design.observer, **changes))
         return LogRun(own, columns, scales, gap=gap, warm_up=warm_up)
 
-    first_run = started()
-    read = [_read(log_part, first_run.signals, time_zone, time_unit) for log_part in several(data)]
+    signals = new_run().signals
+    read = [_read(log, signals, time_zone, time_unit) for log in several(data)]
     if not units_as_is:
-        for log_part, _ in read:
-            units = UnitCheck(design, first_run.signals)
-            units.take(first_run.signals.deviations(log_part))
+        for log_rows, _ in read:
+            units = UnitCheck(design, signals)
+            units.take(signals.deviations(log_rows))
             units.finish()
-    log, borders = (
-        np.vstack([log_part for log_part, _ in read]),
-        np.cumsum([0, *(len(log_part) for log_part, _ in read)]),
-    )
-    ends = list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
-    if len(log) < LEAST_NORMAL:
-        raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
-    before = 1 + first_run.signals.inputs
-    stuck = [
-        [(first + a, last + a) for a, b in ends for first, last in stuck_rows(column[a:b])]
-        for column in log[:, before:].T
-    ]
-    # As runs do it: a sample counts as not measured before it is known for how long it is repeated.
-    repeats = longest_repeats([log[a:b, before:] for a, b in ends])
-    parts = [log[a:b] for a, b in ends if a < b]
-    unrepeated = [Unrepeated(repeats).of_rows(part[:, before:], rising(part[:, 0].tolist()))[0] for part in parts]
-    log = np.hstack([log[:, :before], np.vstack(unrepeated)])
-    output, sizes = _output_and_outlier_sizes(design, started, log, ends)
+    logs = _NormalLogs.of([log_rows for log_rows, _ in read], signals)
+    output, sizes = _output_and_outlier_sizes(design, new_run, logs.rows, logs.ends)
     starts = started_anywhere(design.observer, output.starts)
     if starts is not None:
-        output = _output_of_logs(design, lambda: started(sizes), log, ends)
-    dt = design.observer.dt or float(np.median(np.diff(output.times)))
-    every = rows_per_alarm(false_alarms, dt)
-    output, pairs = _without_pairs(design, lambda: started(sizes), log, ends, output, every)
-    wanted = [(a + first, a + last) for a, b in ends for first, last in [parsed_rows(rows, b - a)]]
-    chosen = np.any([(first <= output.numbers) & (output.numbers < last) for first, last in wanted], axis=0)
-    dt = design.observer.dt or float(np.median(np.diff(output.times[chosen])))
-    watched, scores = output.watched[chosen], None if output.scores is None else output.scores.chosen(chosen)
-    squares = output.squares[chosen]
-    squares = squares[np.isfinite(squares) & (squares > 0.0)]
-    places = np.searchsorted(output.numbers[chosen], borders)
-    logs = tuple(slice(a, b) for a, b in zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
+        output = _output_of_logs(design, lambda: new_run(sizes, starts), logs.rows, logs.ends)
+    every = rows_per_alarm(false_alarms, _sample_time(design, output))
+    output, pairs = _without_pairs(design, lambda: new_run(sizes, starts), logs.rows, logs.ends, output, every)
+    wanted = [(a + first, a + last) for a, b in logs.ends for first, last in [parsed_rows(rows, b - a)]]
+    output = output.of_rows(wanted)
+    dt = _sample_time(design, output)
     options: dict[str, Any] = {
-        "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs, "logs": logs,
-        "repeats": repeats,
+        "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs,
+        "logs": logs.slices_of(output.numbers), "repeats": logs.repeats,
     }  # fmt: skip
     learned = thresholds_from_rows(
         design,
-        watched,
-        scores=scores,
-        innovation=float(np.sqrt(squares.mean())) if squares.size else 1.0,
+        output.watched,
+        scores=output.scores,
+        innovation=output.innovation_size(),
         outlier_sizes=sizes,
         initial_covariance=starts,
         **options,
     )
-    raised = raised_levels(design, learned, watched, scores, **options)
-    outputs = first_run.signals.names[first_run.signals.inputs :]
-    by_name = dict(zip(outputs, stuck, strict=True))
+    raised = raised_levels(design, learned, output.watched, output.scores, **options)
     notes = notes_of_normal_rows(
-        raised, output.numbers[chosen], log[:, 0], wanted, by_name, ends, [log_part for _, log_part in read]
+        raised, output.numbers, logs.rows[:, 0], wanted, logs.stuck, logs.ends, [stamps for _, stamps in read]
     )
-    white = learned.statistics.model.whitened(watched_rows(design, learned, watched))
-    inputs = log[output.numbers[chosen], 1 : 1 + first_run.signals.inputs]
-    divided = notes_of_starts(divided_at_starts(design.observer, scores if learned.statistics.estimates else None))
-    return replace(learned, notes=(*notes, *notes_of_sizes(white, inputs), *divided))
+    white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
+    inputs = logs.rows[output.numbers, 1 : 1 + signals.inputs]
+    divided = divided_at_starts(design.observer, output.scores if learned.statistics.estimates else None)
+    return replace(learned, notes=(*notes, *notes_of_sizes(white, inputs), *notes_of_starts(divided)))
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalLogs:
+    """Logs without faults, one after the other, and what is stuck in them."""
+
+    rows: FloatArray  # ``(n, 1 + nu + ny)``: NaN for what a stuck sensor repeats
+    borders: NDArray[np.int64]  # of the logs, from 0 to n
+    stuck: dict[str, list[tuple[int, int]]]  # by output: first and last rows
+    repeats: FloatArray  # ``(ny,)``: from which equal sample on an output counts as not measured
+
+    @classmethod
+    def of(cls, logs: Sequence[FloatArray], signals: LogSignals) -> _NormalLogs:
+        """Return logs that hold enough rows, with the samples that a stuck sensor repeats taken as not measured."""
+        rows, borders = np.vstack(logs), np.cumsum([0, *map(len, logs)])
+        if len(rows) < LEAST_NORMAL:
+            raise SpecError(f"The log has {len(rows)} rows: give {LEAST_NORMAL} and more.", path="normal")
+        before = 1 + signals.inputs
+        ends = _ends_of(borders)
+        stuck = [
+            [(first + a, last + a) for a, b in ends for first, last in stuck_rows(column[a:b])]
+            for column in rows[:, before:].T
+        ]
+        # As runs do it: a sample counts as not measured before it is known for how long it is repeated.
+        repeats = longest_repeats([rows[a:b, before:] for a, b in ends])
+        parts = [rows[a:b] for a, b in ends if a < b]
+        unrepeated = [Unrepeated(repeats).of_rows(part[:, before:], rising(part[:, 0].tolist()))[0] for part in parts]
+        by_output = dict(zip(signals.names[signals.inputs :], stuck, strict=True))
+        return cls(np.hstack([rows[:, :before], np.vstack(unrepeated)]), borders, by_output, repeats)
+
+    @property
+    def ends(self) -> list[tuple[int, int]]:
+        """First row of each log, and the one after its last."""
+        return _ends_of(self.borders)
+
+    def slices_of(self, numbers: NDArray[np.int64]) -> tuple[slice, ...]:
+        """Return for each log which of some ascending row numbers are its own."""
+        return tuple(slice(a, b) for a, b in _ends_of(np.searchsorted(numbers, self.borders)))
+
+
+def _ends_of(borders: NDArray[np.int64]) -> list[tuple[int, int]]:
+    return list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
+
+
+def _sample_time(design: ObserverDesign, output: _ObserverOutput) -> float:
+    """Return the seconds between samples: the design's, or the median of the log's where it is continuous in time."""
+    return design.observer.dt or float(np.median(np.diff(output.times)))
 
 
 def _output_and_outlier_sizes(
     design: ObserverDesign,
-    started: Callable[[FloatArray | None], LogRun],
+    new_run: Callable[[FloatArray | None], LogRun],
     log: FloatArray,
     ends: Sequence[tuple[int, int]],
 ) -> tuple[_ObserverOutput, FloatArray | None]:
     """Return what a design says of rows without faults, and how far off outliers are by these rows ``(ny,)``; `None`
     where that is what the design says."""
-    run = started(None)
+    run = new_run(None)
     if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
             and has_innovations_by_sensor(design.observer)):  # fmt: skip
-        return _output_of_logs(design, lambda: started(None), log, ends), None
+        return _output_of_logs(design, lambda: new_run(None), log, ends), None
     ny = len(run.observer.output_names)
     stated = run.observer.observer.outlier_sizes
-    output = _output_of_logs(design, lambda: started(np.zeros(ny)), log, ends)
+    output = _output_of_logs(design, lambda: new_run(np.zeros(ny)), log, ends)
     usual = checked_limit("gate", run.observer.observer.outlier_limit) * np.sqrt(
         np.nanmean(output.watched[:, -ny:] ** 2, axis=0)
     )
@@ -242,7 +263,7 @@ def _output_and_outlier_sizes(
     sizes = learned_sizes(wrong_samples(output.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
     if not sizes.any():
         return (output, None) if stated is None else (output, sizes)
-    return _output_of_logs(design, lambda: started(sizes), log, ends), None if stated is not None and np.array_equal(
+    return _output_of_logs(design, lambda: new_run(sizes), log, ends), None if stated is not None and np.array_equal(
         sizes, stated
     ) else sizes
 
@@ -287,7 +308,7 @@ def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatA
 
 
 class _ObserverOutput(NamedTuple):
-    """What a design says of a log."""
+    """What an observer returns in each row of a log, as thresholds are learned from it."""
 
     numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
     times: FloatArray  # ``(n,)`` seconds
@@ -296,6 +317,22 @@ class _ObserverOutput(NamedTuple):
     scores: Scores | None  # of the faults, where it is known what samples say of these
     starts: FloatArray  # ``(nx,)``: how far the estimated states have been from those at the start
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
+
+    def of_rows(self, ranges: Sequence[tuple[int, int]]) -> _ObserverOutput:
+        """Return the rows whose numbers are in some ranges."""
+        chosen = np.any([(first <= self.numbers) & (self.numbers < last) for first, last in ranges], axis=0)
+        return self._replace(
+            numbers=self.numbers[chosen],
+            times=self.times[chosen],
+            watched=self.watched[chosen],
+            squares=self.squares[chosen],
+            scores=None if self.scores is None else self.scores.chosen(chosen),
+        )
+
+    def innovation_size(self) -> float:
+        """Return the root mean square of the innovations in the observer's own deviations, 1 where it has none."""
+        squares = self.squares[np.isfinite(self.squares) & (self.squares > 0.0)]
+        return float(np.sqrt(squares.mean())) if squares.size else 1.0
 
 
 def _output_of_logs(

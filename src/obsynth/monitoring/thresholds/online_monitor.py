@@ -185,11 +185,7 @@ def online_monitor(
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     model = model.held() if disturbance == "held" else model
     require_noise(noise_bound, noisy=model.noisy)
-    bounds = bounds_of(design, model, disturbance_bounds)
-    if scenario is None:
-        # Only those that are given are known.
-        stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
-        bounds = np.where(np.array(stated, dtype=bool), bounds, np.inf)
+    bounds = _known_bounds(design, model, disturbance_bounds, scenario)
     noisy = noisy_design(design, scenario)
     limited = kind in ("pointwise", "window")
 
@@ -216,9 +212,7 @@ def online_monitor(
         _require_above_rounding(kind, limit, model, bounds)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
-        ending = (_AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
-        ending += _UNEVEN * bool(norm.irregular is not None and np.isinf(norm.irregular[1]))
-        ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
+        ending = _ending(kind, model, norm, limit, gaps, dt, from_the_first=initial_error is not None)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH + (_JITTERING if model.continuous is not None else "")
@@ -315,6 +309,33 @@ def _norm_rule(
         driven=driven,
     )
     return rule, limit
+
+
+def _known_bounds(
+    design: ObserverDesign, model: ResidualModel, stated: Mapping[str, float] | None, scenario: Scenario | None
+) -> FloatArray:
+    """Return the largest absolute value of each disturbance ``(nd,)``: infinite where nothing states it."""
+    bounds = bounds_of(design, model, stated)
+    if scenario is not None:
+        return bounds
+    is_stated = [name in (stated or {}) for name in design.linear[0].disturbance_names]
+    return np.where(np.array(is_stated, dtype=bool), bounds, np.inf)
+
+
+def _ending(
+    kind: str,
+    model: ResidualModel,
+    norm: NormRule,
+    limit: float,
+    gaps: GapGrowth | str,
+    dt: float,
+    *,
+    from_the_first: bool,
+) -> str:
+    """Return the end of the statement of a bound: from when it holds, for which stamps, and what happens in gaps."""
+    ending = (_AFTER_A_GAP if from_the_first else _AFTER_WARM_UP) + _more_words(kind, model, limit, dt)
+    ending += _UNEVEN * bool(norm.irregular is not None and np.isinf(norm.irregular[1]))
+    return ending + (_WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps))
 
 
 def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str:

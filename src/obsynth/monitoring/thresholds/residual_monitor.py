@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -137,8 +138,8 @@ def monitor(
     ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
     ... )
     >>> monitor = obsynth.monitor(design, scenario)
-    >>> found = monitor.watch(obsynth.simulate(design, scenario).estimates)
-    >>> found.fault, found.time
+    >>> detection = monitor.watch(obsynth.simulate(design, scenario).estimates)
+    >>> detection.fault, detection.time
     ('f1', 11.0)
     """
     require_verified(design, unverified=unverified)
@@ -167,12 +168,8 @@ def monitor(
     if kind in ("chi-square", "cusum"):
         rule = _whitened_rule(kind, model, start, **numbers)
     else:
-        threshold = _norm_threshold(
-            kind, model, bounds, start, design.linear[0].disturbance_names, gamma, noise_bound, window
-        )
-        if model.continuous is not None:
-            threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-        rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
+        inputs = _ResidualInputs(design, scenario, model, bounds, noise_bound, start)
+        rule = _norm_rule(kind, inputs, gamma, window, rows, bench.signals.dt)
     noisy = noisy_design(design, scenario)
     quiet = bool(design.linear[0].nw and not noisy.linear[0].nw)
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start, noise_left_out=quiet)
@@ -243,22 +240,36 @@ def _whitened_rule(
     )
 
 
-def _norm_threshold(
-    kind: str,
-    model: ResidualModel,
-    bounds: FloatArray,
-    start: float,
-    disturbances: Sequence[str],
-    gamma: float | None,
-    noise_bound: float | None,
-    window: int,
-) -> FloatArray:
+@dataclass(frozen=True, eq=False)
+class _ResidualInputs:
+    """What acts on the residual of a design in a scenario: bounded disturbances, noise, and the error at the start."""
+
+    design: ObserverDesign
+    scenario: Scenario
+    model: ResidualModel
+    bounds: FloatArray  # ``(nd,)``: largest absolute values of the disturbances
+    noise_bound: float | None  # in standard deviations
+    start: float  # norm of the error of the state
+
+
+def _norm_rule(
+    kind: str, inputs: _ResidualInputs, gamma: float | None, window: int, rows: slice, dt: float
+) -> NormRule:
+    """Return the rule of a bound on the norm of the residual at each sample of the scenario."""
+    threshold = _norm_threshold(kind, inputs, gamma, window)
+    if inputs.model.continuous is not None:
+        threshold = threshold + _straight_lines(inputs, kind, window, rows)
+    return NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=dt)
+
+
+def _norm_threshold(kind: str, inputs: _ResidualInputs, gamma: float | None, window: int) -> FloatArray:
     """Return the threshold of a norm at each sample, for what acts on the samples."""
+    model = inputs.model
     if kind == "paper":
-        return paper_threshold(model, bounds, start, gamma)
-    inputs = scaled_inputs(model, bounds, noise_bound, disturbances)
-    threshold = pointwise_threshold(model, inputs, start)
-    return threshold if kind == "pointwise" else window_threshold(model, inputs, start, window)
+        return paper_threshold(model, inputs.bounds, inputs.start, gamma)
+    scaled = scaled_inputs(model, inputs.bounds, inputs.noise_bound, inputs.design.linear[0].disturbance_names)
+    threshold = pointwise_threshold(model, scaled, inputs.start)
+    return threshold if kind == "pointwise" else window_threshold(model, scaled, inputs.start, window)
 
 
 def bounds_of(design: ObserverDesign, model: ResidualModel, stated: Mapping[str, float] | None) -> FloatArray:
@@ -286,14 +297,13 @@ def _floor(bench: Bench, plant: DescriptorSystem, scenario: Scenario, rows: slic
     return RESIDUAL_ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
 
 
-def _straight_lines(
-    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int, rows: slice
-) -> FloatArray:
+def _straight_lines(inputs: _ResidualInputs, kind: str, window: int, rows: slice) -> FloatArray:
     """Return what straight lines between samples add to a norm of the residual: known inputs and start alone."""
+    model, scenario = inputs.model, inputs.scenario
     if kind not in ("pointwise", "window"):
         return np.zeros(model.steps)
     calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
-    bench = make_bench(design, calm)
+    bench = make_bench(inputs.design, calm)
     residuals = bench.run([scenario.seed]).rows[:, 0, rows]
     sizes = np.array(
         [

@@ -192,8 +192,8 @@ def _worst_states(estimates: Estimates, states: ArrayLike | None) -> tuple[list[
     else:
         size, ranges, what = np.ptp(values, axis=0), np.ones(values.shape[1]), "largest motion"
     order = np.argsort(-size / np.where(ranges > 0.0, ranges, 1.0), kind="stable")[:MOST_STATE_PANELS]
-    told = f"The {MOST_STATE_PANELS} of {values.shape[1]} states with the {what}"
-    return [int(i) for i in order], told
+    title = f"The {MOST_STATE_PANELS} of {values.shape[1]} states with the {what}"
+    return [int(i) for i in order], title
 
 
 @arguments_checked
@@ -248,9 +248,9 @@ def plot_states(
     """
     known = estimates.state_names
     chosen = range(len(known)) if names is None else [index_of(name, known, what="The estimates") for name in names]
-    told = ""
+    title = ""
     if names is None and axes is None and len(known) > MOST_STATE_PANELS:
-        chosen, told = _worst_states(estimates, states)
+        chosen, title = _worst_states(estimates, states)
     panels = new_panels(axes, len(chosen))
     _draw(
         panels,
@@ -264,8 +264,8 @@ def plot_states(
         delays=estimates.state_delays,
         deviations=estimates.state_deviations if estimates.has_deviations else None,
     )
-    if told and (figure := panels[0].get_figure()) is not None:
-        figure.suptitle(told, fontsize="medium")
+    if title and (figure := panels[0].get_figure()) is not None:
+        figure.suptitle(title, fontsize="medium")
     return panels
 
 
@@ -314,11 +314,11 @@ def _share_within(true: FloatArray, low: FloatArray, high: FloatArray) -> str:
     return f", contains the truth in {100.0 * held / np.count_nonzero(known):.0f} % of samples" if known.any() else ""
 
 
-def _matching(given: ArrayLike | None, shape: tuple[int, ...], what: str) -> FloatArray | None:
+def _matching(values: ArrayLike | None, shape: tuple[int, ...], what: str) -> FloatArray | None:
     """Return the truth ``(samples, n)``; a single signal may be ``(samples,)``."""
-    if given is None:
+    if values is None:
         return None
-    raw = np.asarray(given)
+    raw = np.asarray(values)
     true = as_matrix(raw[:, None] if raw.ndim == 1 else raw, "true signals")
     if true.shape != shape:
         raise SpecError(

@@ -132,14 +132,14 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
     frequencies, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
     disturbance_gains = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
-        found = _disturbance_gains(plant, points, to_estimate)
+        coarse = _disturbance_gains(plant, points, to_estimate)
         # A peak lies between the frequencies of the grid: beside the largest gains they are looked at closely.
         top = frequencies[-1] * (GRID_REACH if observer.dt == 0.0 else 1.0)
         sides = np.concatenate([frequencies[:1] / GRID_REACH, frequencies, [top]])
-        peaks = np.unique(found.argmax(axis=0))
+        peaks = np.unique(coarse.argmax(axis=0))
         near = np.concatenate([np.geomspace(sides[k], sides[k + 2], POINTS_OF_A_PEAK) for k in peaks])
-        closely = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
-        disturbance_gains = np.maximum(found.max(axis=0), closely.max(axis=0))
+        fine = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
+        disturbance_gains = np.maximum(coarse.max(axis=0), fine.max(axis=0))
     own = [plant.fault_names.index(name) for name in observer.fault_names]
     _, slowest, _ = _responses(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]

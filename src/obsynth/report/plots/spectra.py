@@ -182,9 +182,9 @@ def _damping_grid(axes: Axes, *, sampled: bool) -> None:
 def region_asked_for(design: ObserverDesign) -> list[Excess]:
     """Return the parts of the region that was asked for (or imposed and proved); none where none was."""
     claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
-    asked = options.get("region") or {}
-    asked = dict(asked) if isinstance(asked, Mapping) else {}
-    decay = asked.get("decay") or options.get("decay") or 0.0
+    region = options.get("region") or {}
+    region = dict(region) if isinstance(region, Mapping) else {}
+    decay = region.get("decay") or options.get("decay") or 0.0
     if design.method in REGISTRY and "decay" in method_class(design.method).imposed:
         decay = claims.get("decay", 0.0)
     parts: list[Excess] = []
@@ -192,10 +192,10 @@ def region_asked_for(design: ObserverDesign) -> list[Excess]:
         parts.append(lambda z: np.abs(z) - np.exp(-decay * dt))
     elif decay:
         parts.append(lambda s: s.real + decay)
-    if asked.get("radius"):
-        parts.append(lambda s: np.abs(s) - asked["radius"])
-    if asked.get("damping"):
-        parts.append(lambda s: asked["damping"] * np.abs(s) + s.real)
+    if region.get("radius"):
+        parts.append(lambda s: np.abs(s) - region["radius"])
+    if region.get("damping"):
+        parts.append(lambda s: region["damping"] * np.abs(s) + s.real)
     if "disk_radius" in claims:
         parts.append(lambda s: np.abs(s + claims["disk_centre"]) - claims["disk_radius"])
     return parts

@@ -177,7 +177,7 @@ def draw_region_trade_off(
 ) -> Axes:
     """Draw a claim and its values over sizes of a region, or rates; places without a design are marked below."""
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
-    methods = [one.method for one in designs if not isinstance(one, str)]
+    methods = [design.method for design in designs if not isinstance(design, str)]
     name, proved = claim
     finite = np.isfinite(numbers)
     # Any course stands right of the fastest rate.
@@ -185,7 +185,7 @@ def draw_region_trade_off(
     panel.plot(places, proved, color="black", marker="o", markersize=4, label="proved")
     if np.isfinite(reached).any():
         panel.plot(places, reached, color="0.5", marker="x", linestyle=":", label="reached by some course")
-    missing = np.array([isinstance(one, str) for one in designs])
+    missing = np.array([isinstance(design, str) for design in designs])
     panel.set_ylim(bottom=0.0)
     if missing.any():
         panel.plot(places[missing], np.zeros(missing.sum()), "x", color="tab:red", clip_on=False, label="none found")

@@ -64,7 +64,7 @@ def add_arguments(parser: Any, arguments: Iterable[Argument | Group | Settings])
 
 def settings_of(arguments: Iterable[Argument | Group | Settings]) -> tuple[Argument, ...]:
     """Return the arguments that are settings."""
-    return tuple(one for item in arguments if isinstance(item, Settings) for one in item.arguments)
+    return tuple(argument for item in arguments if isinstance(item, Settings) for argument in item.arguments)
 
 
 class Folded(argparse.RawDescriptionHelpFormatter):
@@ -99,8 +99,8 @@ def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) 
     for action in own._actions:
         name = action.option_strings[0].removeprefix("--")
         value = action.metavar or ("true" if action.const else "|".join(map(str, action.choices or ("VALUE",))))
-        told = (action.help or "") % {"default": action.default}
-        lines.append(f"  {name}={value}: {told}")
+        help_text = (action.help or "") % {"default": action.default}
+        lines.append(f"  {name}={value}: {help_text}")
     parser.epilog = "\n".join([*([parser.epilog, ""] if parser.epilog else []), *lines])
     parser.formatter_class = Folded
 
@@ -116,14 +116,14 @@ def read_settings(
 ) -> list[str]:
     """Put the settings of a command line into its options, and return what is no setting of the verb."""
     parser = _settings_parser(prog, settings_of(arguments))
-    given = []
+    words = []
     for name, value in getattr(options, "settings", ()):
         known = parser._option_string_actions.get(f"--{name}")
         if known is not None and known.nargs == 0:
-            given += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
+            words += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
         else:
-            given.append(f"--{name}={value}")
-    return parser.parse_known_args([*given, *rest], namespace=options)[1]
+            words.append(f"--{name}={value}")
+    return parser.parse_known_args([*words, *rest], namespace=options)[1]
 
 
 def setting(text: str) -> tuple[str, str]:
@@ -205,11 +205,11 @@ def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
 
 def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
     """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
-    found: dict[str, float | tuple[float, float]] = {}
+    ranges: dict[str, float | tuple[float, float]] = {}
     for name, text in pairs:
         low, colon, high = text.partition(":")
-        found[name] = (number_of(name, low), number_of(name, high)) if colon else number_of(name, text)
-    return found
+        ranges[name] = (number_of(name, low), number_of(name, high)) if colon else number_of(name, text)
+    return ranges
 
 
 def flag_of(name: str) -> str:

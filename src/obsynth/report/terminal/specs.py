@@ -52,9 +52,9 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
     own, stated = (getattr(plant, "constants", None) or {} for plant in (design.plant, spec.plant))
     others = [name for name, value in own.items() if stated.get(name, value) != value]
     if others:
-        told = ", ".join(f"{name} {own[name]:.6g} for {stated[name]:.6g}" for name in others[:MOST_TOLD_CONSTANTS])
+        changes = ", ".join(f"{name} {own[name]:.6g} for {stated[name]:.6g}" for name in others[:MOST_TOLD_CONSTANTS])
         print(
-            f"Warning: {gains} is for a plant with other constants than that of {spec.path} ({told}"
+            f"Warning: {gains} is for a plant with other constants than that of {spec.path} ({changes}"
             f"{', ...' if len(others) > MOST_TOLD_CONSTANTS else ''}): the plant of the gain set is used.",
             file=sys.stderr,
         )
