@@ -221,7 +221,7 @@ def _exit_codes() -> list[str]:
 
 def _command(name: str, verb: Any) -> list[str]:
     parser = command_line._with_verb(name, argparse.ArgumentParser(prog=f"obsynth {name}"))
-    lines = [f"## obsynth {name}", "", _text(verb.told), ""]
+    lines = [f"## obsynth {name}", "", _text(verb.help_text), ""]
     lines += ["```sh", EXAMPLES[name], "```", ""]
     rows = []
     for action in parser._actions:

@@ -94,9 +94,9 @@ def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentPar
     for name, verb in VERBS.items():
         own = verbs.add_parser(
             name,
-            help=verb.told,
+            help=verb.help_text,
             add_help=words is None or name in words,
-            description=fill(verb.told, width=78),
+            description=fill(verb.help_text, width=78),
             epilog=verb.epilog,
             formatter_class=Folded if verb.epilog else argparse.HelpFormatter,
         )
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
     """Run ``design``, which is ``obsynth design``."""
-    return _run(_with_verb("design", _parser("design", VERBS["design"].told)), arguments)
+    return _run(_with_verb("design", _parser("design", VERBS["design"].help_text)), arguments)
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:

@@ -153,7 +153,7 @@ class LearnedMonitorInC:
             *integer_table("monitor_ages", AGES),
             *integer_table("monitor_places", [self.columns.index(name) for name in learned.columns]),
             *integer_table("monitor_seldom", [int(name in learned.seldom) for name in self.columns]),
-            *integer_table("monitor_told", [faults.get(name, -1) for name in learned.statistics.told]),
+            *integer_table("monitor_told", [faults.get(name, -1) for name in learned.statistics.signature_names]),
         ]
         return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
 

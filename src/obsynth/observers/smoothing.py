@@ -73,7 +73,7 @@ class _DAELinearisation(StepLinearisation):
             x = x - self.steps.part(after, "K") @ row.part("innovation")
         else:
             x = x - self.steps.part(after, "Upsilon") @ (self.steps.part(after, "theta") - theta)
-        measured = row.seen
+        measured = row.measured
         _, H, L = self.steps.graph.functions.outputs(x, theta)
         R = self.steps.settings.R[np.ix_(measured, measured)]
         noise, missing = np.asarray(row.part("noise") @ self.Q), row.part("missing")
@@ -128,8 +128,8 @@ class _ConstantParameters(_DAELinearisation):
         at, theta = self.sample(before, after, row), self.steps.part(after, "theta")
         # The state is corrected where the parameters have moved it already.
         moved = self.steps.part(after, "x")
-        y = at.e + self.steps.graph.functions.outputs(at.x, at.theta)[0][row.seen]
-        expected, H, L = (part[row.seen] for part in self.steps.graph.functions.outputs(moved, theta))
+        y = at.e + self.steps.graph.functions.outputs(at.x, at.theta)[0][row.measured]
+        expected, H, L = (part[row.measured] for part in self.steps.graph.functions.outputs(moved, theta))
         nx, count = self.nx, len(y)
         right = np.zeros((nx + count, 1 + self.nq))
         right[:nx, 1:], right[nx:, 0], right[nx:, 1:] = self.steps.part(after, "Upsilon"), y - expected, -L

@@ -306,7 +306,7 @@ def _closely_timed(
 
 
 def design_warnings(
-    design: ObserverDesign, steps: Mapping[str, FaultFigures], *, told: Collection[str] = ()
+    design: ObserverDesign, steps: Mapping[str, FaultFigures], *, reported: Collection[str] = ()
 ) -> tuple[str, ...]:
     """Return what to know before trusting the fault estimates; ``steps`` from `followed_steps`."""
     pair = _estimating(design)
@@ -316,7 +316,7 @@ def design_warnings(
         f"A unit step of {name} gives an estimate of {_of_one(figures.at_horizon)} after {figures.horizon:.2g} s: it "
         "has not reached the fault by then."
         for name, figures in steps.items()
-        if not figures.reaches and name not in told
+        if not figures.reaches and name not in reported
     )
     return (*_undetectable(*pair), *missed)
 

@@ -345,7 +345,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
             share = f"{round(100.0 * followed)} %" if abs(followed) <= FAR_FROM_ONE else "many times the size"
             not_followed.append(fault)
             yield f"the estimate of {fault} does not follow a step: its steady state is {share} of it."
-    yield from design_warnings(design, steps, told=not_followed)
+    yield from design_warnings(design, steps, reported=not_followed)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             place = check.name.removeprefix("limit at ")

@@ -51,7 +51,7 @@ class LogSignals:
     scale: FloatArray  # scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset
     offset: FloatArray
     point: Mapping[str, float]  # the operating point
-    one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
+    constant_signal: int | None = None  # number of the signal that is 1 in every row and has no column, if there is one
     inputs: int = 0  # columns of known inputs
     delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
     units: Mapping[str, str] = field(default_factory=dict)  # of signals whose factor nobody states
@@ -115,7 +115,7 @@ class LogSignals:
         SpecError
             A unit cannot be converted.
         """
-        names = [name for i, name in enumerate(self.names) if i != self.one]
+        names = [name for i, name in enumerate(self.names) if i != self.constant_signal]
         factors, shifts = np.ones(len(names)), np.zeros(len(names))
         for i, (name, place) in enumerate(zip(names, places[1:], strict=True)):
             base = derivative_of(name, names)
@@ -141,7 +141,9 @@ class LogSignals:
 
     def measured(self, rows: FloatArray) -> FloatArray:
         """Return signals in their units ``(rows, nu + ny)`` from rows of time and columns."""
-        read = rows[:, 1:] if self.one is None else np.insert(rows[:, 1:], self.one, 1.0, axis=1)
+        read = (
+            rows[:, 1:] if self.constant_signal is None else np.insert(rows[:, 1:], self.constant_signal, 1.0, axis=1)
+        )
         return np.asarray(self.scale * read)
 
     def deviations(self, rows: FloatArray) -> FloatArray:

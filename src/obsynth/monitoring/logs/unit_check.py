@@ -33,7 +33,7 @@ class ChangeOfUnit(NamedTuple):
 
     factor: float
     shift: float
-    told: str
+    words: str
 
 
 CHANGES = (
@@ -90,7 +90,7 @@ class UnitCheck:
             remedy = f"give the factor ({option}, scales={{{name!r}: {change.factor:.15g}}})"
         made = f"adding {change.shift:g}" if change.shift else f"multiplying by {change.factor:.6g}"
         raise SpecError(
-            f"From its first row on {name} is not what the design expects, and is after {made} ({change.told}): "
+            f"From its first row on {name} is not what the design expects, and is after {made} ({change.words}): "
             f"{remedy}; or go on as it is (--units-as-is, units_as_is=True).",
             path=f"columns.{name}",
         )
@@ -105,7 +105,7 @@ class UnitCheck:
     def _changed(self, rows: FloatArray) -> Iterator[tuple[int, ChangeOfUnit, FloatArray]]:
         """Yield each signal with each change of unit, and the rows after it."""
         for i in range(rows.shape[1]):
-            if i == self._signals.one or not np.any(rows[:, i] + self._signals.offset[i]):
+            if i == self._signals.constant_signal or not np.any(rows[:, i] + self._signals.offset[i]):
                 continue
             for change in CHANGES:
                 yield i, change, self._after(rows, i, change)

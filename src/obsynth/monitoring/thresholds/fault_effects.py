@@ -110,7 +110,7 @@ class FaultEffects(ABC):
     def step(
         self, state: EffectState, observation: Any, white: FloatArray, seen: NDArray[np.bool_] | None, *, counts: bool
     ) -> EffectState:
-        """Return the state after a sample of which the observer ``said`` something: its residuals are ``white (m,)``,
+        """Return the state after a sample with the observer's ``observation``: its residuals are ``white (m,)``,
         of which those that were ``seen (m,)`` are measured, or none (`None`)."""
         if isinstance(observation, DAERow) and observation.k == 0:
             return self.init()
@@ -203,7 +203,7 @@ class FilterEffects(FaultEffects):
         effect = reading @ error
         effect[:, outputs, sensors] += 1.0
         effect[:, outputs, sensors + ny] += rows[:, None]
-        effect[:, ~observation.seen] = 0.0
+        effect[:, ~observation.measured] = 0.0
         error = error - _gain(observation, reading, self.R) @ effect
         estimates = -error[:, nx:]
         estimates[:, moved, moved] += 1.0
@@ -279,7 +279,7 @@ def _gain(observation: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray
     joint_covariance[:nx, :nx], joint_covariance[nx:, nx:] = observation.covariance, observation.parameter_covariance
     joint_covariance[:nx, nx:] = observation.cross_covariance
     joint_covariance[nx:, :nx] = joint_covariance[:nx, nx:].T
-    measured, gain = observation.seen, np.zeros((len(joint_covariance), len(reading)))
+    measured, gain = observation.measured, np.zeros((len(joint_covariance), len(reading)))
     gain[:, measured] = np.linalg.solve(R[measured][:, measured], reading[measured] @ joint_covariance).T
     return gain
 

@@ -214,7 +214,7 @@ class LearnedThresholds:
             "whitener": model.whitener,
             "signatures": self.statistics.signatures,
             "age_levels": self.statistics.levels_by_age,
-            "told": list(self.statistics.told),
+            "told": list(self.statistics.signature_names),
             "levels": self.levels,
             "every": self.every,
             "rows": self.rows,

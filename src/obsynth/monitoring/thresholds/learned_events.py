@@ -90,6 +90,6 @@ def factors(
 
 def _powers(statistics: Statistics) -> tuple[FloatArray, FloatArray]:
     """Return the squares of what a step of each signature does to white rows ``(s,)``: to its first, to `HOLD` rows."""
-    steps = statistics.responses()[0][: len(statistics.told)]
+    steps = statistics.responses()[0][: len(statistics.signature_names)]
     squares = np.sum(steps**2, axis=-1)
     return squares[:, 0], squares[:, np.minimum(np.arange(HOLD), squares.shape[1] - 1)].sum(axis=1)

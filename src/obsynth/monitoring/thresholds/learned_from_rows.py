@@ -106,7 +106,7 @@ def thresholds_from_rows(
     directions = (
         signatures(design, chosen, np.sqrt(np.nanvar(x, axis=0)))
         if like is None
-        else (like.statistics.signatures, like.statistics.told)
+        else (like.statistics.signatures, like.statistics.signature_names)
     )
     statistics = Statistics(model, *directions, estimates=() if scores is None else names[:faults])
     lasting, extrapolated = 0.0, False

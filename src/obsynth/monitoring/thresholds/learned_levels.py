@@ -85,7 +85,7 @@ def _levels_by_age(parts: Sequence[tuple[Statistics, FloatArray]], every: float)
     normal streams: statistics and white rows ``(1, n, m)`` of each."""
     rate = min(max(every * RARER[0], AGES_APART * max(AGES)), sum(e.shape[1] - SETTLING for _, e in parts) / OBSERVED)
     by_age = []
-    for i in range(2 * len(parts[0][0].told)):
+    for i in range(2 * len(parts[0][0].signature_names)):
         runs = [list(likelihood_ratios(e, *(part[i] for part in judged.responses()))) for judged, e in parts]
         own = [level_of(np.concatenate(ages), rate) for ages in zip(*runs, strict=True)]
         # Ages for which the streams are too short are as the oldest of them.
@@ -401,7 +401,7 @@ def with_bands(statistics: Statistics, x: FloatArray, scores: Scores | None, log
     logs = logs or (slice(None),)
     e = statistics.model.whitened(x)
     complete = np.asarray(np.isfinite(e).all(axis=1))
-    lasting = statistics.responses()[0][: len(statistics.told), -1]
+    lasting = statistics.responses()[0][: len(statistics.signature_names), -1]
     powers = np.sum(lasting**2, axis=1)
     values = np.where(complete[:, None], np.nan_to_num(e) @ lasting.T, 0.0)
     bands = [

@@ -192,7 +192,9 @@ class LearnedRule(Rule):
     def _fault(self, watched: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
         names, count = self.learned.columns, len(self.learned.scales)
-        signature = self.learned.statistics.told[int(np.argmax(ratios)) % len(self.learned.statistics.told)]
+        signature = self.learned.statistics.signature_names[
+            int(np.argmax(ratios)) % len(self.learned.statistics.signature_names)
+        ]
         if signature.startswith("fhat["):
             return int(self._places[names.index(signature)])
         if signature in self._faults:

@@ -26,14 +26,15 @@ class Statistics:
     and of a ramp; beside these those of a change of each fault of ``estimates``, and the square of its estimate, of
     which `change_ratios` and `Scores.followed` are apart.
 
-    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show;
+    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``signature_names``: of
+    what they are steps;
     ``age_levels (2 s, ages)``: what likelihood ratios of steps, then ramps, of each age are divided by, by default one;
     ``bands (s,)``: offsets along each signature that alarm nothing, and ``fault_bands (nf,)`` those of the faults.
     """
 
     model: Autoregression
     signatures: FloatArray
-    told: tuple[str, ...]
+    signature_names: tuple[str, ...]
     estimates: tuple[str, ...] = ()
     age_levels: FloatArray | None = None
     bands: FloatArray | None = None
@@ -42,13 +43,13 @@ class Statistics:
     @property
     def levels_by_age(self) -> FloatArray:
         """What likelihood ratios are divided by, ``(2 s, ages)``."""
-        return np.ones((2 * len(self.told), len(AGES))) if self.age_levels is None else self.age_levels
+        return np.ones((2 * len(self.signature_names), len(AGES))) if self.age_levels is None else self.age_levels
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the statistics, in order."""
         means = (f"MEWMA {share:g}" for share in FORGETTING)
-        likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.told)
+        likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.signature_names)
         changes = (f"GLR of a change of {name}" for name in self.estimates)
         return ("T2", *means, *likely, *changes, *(f"square of {name}" for name in self.estimates))
 
@@ -74,8 +75,8 @@ class Statistics:
         """Return what offsets at the ends of `bands` do to the roots of likelihood ratios of steps, then ramps, of each
         age, before these are divided by their levels: ``(2 s, ages)``."""
         if self.bands is None:
-            return np.zeros((2 * len(self.told), len(AGES)))
-        lasting = np.tile(self.responses()[0][: len(self.told), -1] * self.bands[:, None], (2, 1))
+            return np.zeros((2 * len(self.signature_names), len(AGES)))
+        lasting = np.tile(self.responses()[0][: len(self.signature_names), -1] * self.bands[:, None], (2, 1))
         long = self.long_responses()
         sums, powers = (
             np.cumsum(np.einsum("srm,sm->sr", long, lasting), axis=1),

@@ -38,15 +38,15 @@ class DAERow:
 
     graph: ObserverGraph  # which laid it out
     k: int  # number of the (first) sample
-    memory: FloatArray  # memory, said: what is carried on, and what is said besides
-    said: FloatArray
-    seen: NDArray[np.bool_]  # ``(ny,)``, of bool: which outputs were there
+    memory: FloatArray  # what is carried on to the next sample, packed
+    row_values: FloatArray  # what else is computed at this sample, packed
+    measured: NDArray[np.bool_]  # ``(ny,)``, of bool: which outputs were there
     moved: FloatArray  # ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0
 
     def part(self, name: str) -> FloatArray:
         """Return one array by its name in the layouts `obsynth.observers.nonlinear.settings`."""
         layout, values = (
-            (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (self.graph.row, self.said)
+            (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (self.graph.row, self.row_values)
         )
         return layout.part(values, name)
 
@@ -68,7 +68,7 @@ class DAERow:
     @property
     def innovation(self) -> FloatArray:
         """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
-        return np.where(self.seen, self.part("innovation"), np.nan)
+        return np.where(self.measured, self.part("innovation"), np.nan)
 
     @property
     def gap(self) -> FloatArray:
@@ -107,14 +107,14 @@ class DAERow:
     @property
     def degrees(self) -> int:
         """Number of outputs that are there, of one sample."""
-        return int(self.seen.sum())
+        return int(self.measured.sum())
 
     @cached_property
     def several(self) -> DAERow:
         """The same with a leading axis of samples."""
         if self.memory.ndim == 2:
             return self
-        return DAERow(self.graph, self.k, self.memory[None], self.said[None], self.seen[None], self.moved)
+        return DAERow(self.graph, self.k, self.memory[None], self.row_values[None], self.measured[None], self.moved)
 
     @cached_property
     def conditions(self) -> FloatArray:
@@ -170,8 +170,10 @@ class GatheredRows:
         if not self.single:
             return
         first, rows = self.single[0], self.single
-        memory, said, seen = (np.stack([getattr(row, name) for row in rows]) for name in ("memory", "said", "seen"))
-        self._keep(DAERow(first.graph, first.k, memory, said, seen, first.moved))
+        memory, values, measured = (
+            np.stack([getattr(row, name) for row in rows]) for name in ("memory", "row_values", "measured")
+        )
+        self._keep(DAERow(first.graph, first.k, memory, values, measured, first.moved))
         self.single = []
 
     def _keep(self, rows: DAERow) -> None:
@@ -219,7 +221,7 @@ _KEPT_COLUMNS: Mapping[str, Callable[[DAERow], FloatArray]] = {
     "innovations": lambda rows: rows.innovation,
     "innovation_covariances": lambda rows: rows.part("expected"),
     "nis": lambda rows: rows.nis,
-    "nis_degrees": lambda rows: rows.seen.sum(axis=1).astype(np.float64),
+    "nis_degrees": lambda rows: rows.measured.sum(axis=1).astype(np.float64),
     "residuals": lambda rows: rows.part("residual"),
     "conditions": lambda rows: rows.conditions,
     "contraction": lambda rows: rows.contractions,

@@ -111,7 +111,7 @@ class Steps:
     def predicted(self, state: DAEState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean ``(ny,)`` and covariance of outputs from what is received of the next sample."""
         after, row = self.plain(state, received, u)
-        mean, covariance = self._call("forecast", after.memory, row.said)
+        mean, covariance = self._call("forecast", after.memory, row.row_values)
         return mean[:, 0], covariance
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:

@@ -134,15 +134,15 @@ def setting(text: str) -> tuple[str, str]:
     return name.strip().replace("_", "-"), value
 
 
-def option(name: str, metavar: str | None, told: str, **settings: Any) -> Argument:
+def option(name: str, metavar: str | None, help_text: str, **settings: Any) -> Argument:
     """Return an argument with a value; one of the form ``NAME=VALUE`` may be given several times."""
     pairs = {"type": pair, "action": "append", "default": []} if "=" in (metavar or "") and not settings else {}
-    return Argument((name,), {"metavar": metavar, "help": told, **pairs, **settings})
+    return Argument((name,), {"metavar": metavar, "help": help_text, **pairs, **settings})
 
 
-def flag(name: str, told: str) -> Argument:
+def flag(name: str, help_text: str) -> Argument:
     """Return an argument without a value."""
-    return Argument((name,), {"action": "store_true", "help": told})
+    return Argument((name,), {"action": "store_true", "help": help_text})
 
 
 def verbose(what: str) -> Argument:

@@ -13,6 +13,6 @@ class Verb(NamedTuple):
     """A verb; ``run`` imports what it needs when it is called, so that help answers at once."""
 
     run: Callable[[argparse.Namespace], int]
-    told: str
+    help_text: str
     arguments: tuple[Argument | Group | Settings, ...]
     epilog: str | None = None
