@@ -22,7 +22,7 @@ from obsynth.monitoring.calibration.diagnostics import (
 from obsynth.monitoring.calibration.explanations import Explanation, explanations, whitened
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.logs import LogData, RecordedLog, quantum, read_log
-from obsynth.monitoring.calibration.maximum import Objective, greatest_likelihood
+from obsynth.monitoring.calibration.maximum import Maximum, Objective, greatest_likelihood
 from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import Fit
@@ -43,6 +43,7 @@ from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign
 
@@ -167,73 +168,82 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
     parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
     model = observer.model
     held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
-    designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
-    noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
     walk = observer.random_walk if stated_walk(observer).any() else np.zeros((model.nq, model.nq))
     walking = np.diag(walk) > 0.0
     if walking.any() and not held.is_data:
         # Equations given as functions take no further states.
         return {}, 0.0, walk
+    designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
+    noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
     walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
-    made: Any = with_noise(held, walks=walks)[0] if walks else held
-    q, r = variance_names(model.equation_names, model.output_names)
-    keys = dict(zip(model.equation_names, q, strict=True))
-    names = (*(keys[name] for name in noisy), *walks, *r)
+    problem = _variance_problem(observer, log, held, noisy, walks)
     # What is added to the equation of a state that walks acts during the whole step.
     designed = np.concatenate([designed_Q[designed_Q > 0.0], np.diag(walk)[walking] / log.dt**2, designed_R])
-    nothing, start = np.zeros(0), np.concatenate([observer.initial_state, observer.initial_parameters[walking]])
-    unsure = observer.initial_parameter_covariance[np.ix_(walking, walking)]
-    plant = NonlinearPlant(made)
-    graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
-    quanta = np.array([quantum(column) for column in log.y.T])
-    problem = CalibrationProblem(
-        plant,
-        log,
-        log.u,
-        (),
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        (*noisy, *walks),
-        np.full(len(noisy) + len(walks), np.nan),
-        np.full(model.ny, np.nan),
-        start,
-        np.block(
-            [
-                [observer.initial_covariance, np.zeros((model.nx, len(walks)))],
-                [np.zeros((len(walks), model.nx)), unsure],
-            ]
-        ),
-        quanta,
-        LEAST_RATIO * designed_R,
-        graphs,
-        observer.integration,
-        1,
-    )
-    fit = Fit(nothing, start, np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
+    fit = Fit(np.zeros(0), problem.x0, np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
     objective = Objective(problem, fit)
     try:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
         # Without a likelihood nothing can be told of its variances.
         return {}, 0.0, walk
-    ratios = {}
-    for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
-        ratio = float(np.exp(best.z[i]) / variance)
-        z = best.z.copy()
-        z[i] = np.log(variance)
-        if (
-            not len(noisy) <= i < len(noisy) + len(walks)
-            and max(ratio, 1.0 / ratio) > TOLD_FACTOR
-            and objective(z)[0] - best.value > CLEAR_NATS
-        ):
-            ratios[name] = ratio
+    q, r = variance_names(model.equation_names, model.output_names)
+    keys = dict(zip(model.equation_names, q, strict=True))
+    names = (*(keys[name] for name in noisy), *walks, *r)
+    walk_places = slice(len(noisy), len(noisy) + len(walks))
+    ratios = {
+        name: ratio
+        for i, (name, variance) in enumerate(zip(names, designed, strict=True))
+        if not walk_places.start <= i < walk_places.stop
+        and (ratio := _contradicted_ratio(objective, best, i, float(variance))) is not None
+    }
     shares = np.ones(model.nq)
-    likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
+    likeliest = np.exp(best.z[walk_places] - np.log(designed[walk_places]))
     shares[walking] = np.minimum(likeliest, 1.0)
     return ratios, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares)
+
+
+def _variance_problem(
+    observer: DAEObserver, log: RecordedLog, held: DAEModel, noisy: tuple[str, ...], walks: Mapping[str, float]
+) -> CalibrationProblem:
+    """Return the problem of fitting nothing but the variances of a design: of its noisy equations, the parameters that
+    walk, and the sensors; ``held`` is its model with the parameters at their start."""
+    model, nothing = held, np.zeros(0)
+    walking = [name in walks for name in model.parameter_names]
+    extended: Any = with_noise(held, walks=walks)[0] if walks else held
+    plant = NonlinearPlant(extended)
+    across = np.zeros((model.nx, len(walks)))
+    unsure = observer.initial_parameter_covariance[np.ix_(walking, walking)]
+    return CalibrationProblem(
+        plant=plant,
+        log=log,
+        u=log.u,
+        unknown=(),
+        nominal=nothing,
+        low=nothing,
+        high=nothing,
+        prior_means=nothing,
+        prior_weights=nothing,
+        noisy=(*noisy, *walks),
+        known_Q=np.full(len(noisy) + len(walks), np.nan),
+        known_R=np.full(model.ny, np.nan),
+        x0=np.concatenate([observer.initial_state, observer.initial_parameters[walking]]),
+        P0=np.block([[observer.initial_covariance, across], [across.T, unsure]]),
+        quanta=np.array([quantum(column) for column in log.y.T]),
+        floors=LEAST_RATIO * np.diag(observer.R),
+        graphs=sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples),
+        integration=observer.integration,
+        substeps=1,
+    )
+
+
+def _contradicted_ratio(objective: Objective, best: Maximum, i: int, variance: float) -> float | None:
+    """Return the likeliest over a designed variance where the log contradicts that clearly, else `None`."""
+    ratio = float(np.exp(best.z[i]) / variance)
+    if max(ratio, 1.0 / ratio) <= TOLD_FACTOR:
+        return None
+    z = best.z.copy()
+    z[i] = np.log(variance)
+    return ratio if objective(z)[0] - best.value > CLEAR_NATS else None
 
 
 @arguments_checked
@@ -291,8 +301,8 @@ def validate(
     ... )
     >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
     >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=99, noise=1.0)).outputs
-    >>> found = obsynth.validate(design, pd.DataFrame({"time": range(len(log)), "y1": log[:, 0]}))
-    >>> found.passed
+    >>> validation = obsynth.validate(design, pd.DataFrame({"time": range(len(log)), "y1": log[:, 0]}))
+    >>> validation.passed
     True
     """
     note = progress or (lambda text: None)
