@@ -9,6 +9,9 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.numerics.libraries import imported
 
+#: The two characters for micro that look alike: the sign of keyboards, and the letter of the Greek alphabet.
+MICRO_SIGNS = ("\u00b5", "\u03bc")
+
 #: Spellings of temperatures, whose zeros differ: no factor converts one to another.
 _TEMPERATURES = {
     **dict.fromkeys(("K", "kelvin", "Kelvin"), "kelvin"),
@@ -56,7 +59,7 @@ def is_temperature(unit: str) -> bool:
 
 def _spelled(text: str, other: str) -> str:
     """Return a unit without blanks around it, with one sign for micro; C and F are temperatures beside another one."""
-    text = text.strip().replace("\u03bc", "\u00b5")
+    text = text.strip().replace(MICRO_SIGNS[1], MICRO_SIGNS[0])
     known = _TEMPERATURES.get(text, text)
     alone = text in ("C", "F") and other.strip() not in _TEMPERATURES
     return text if alone else known

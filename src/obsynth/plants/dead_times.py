@@ -11,6 +11,7 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, number_in_text, require_mapping, shown
 from obsynth.numerics.arrays import require_no_overflow
+from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.numerics.quantities import in_unit
 from obsynth.plants.signal_names import suggestion
 
@@ -74,8 +75,8 @@ def seconds_of(value: Any, name: str) -> float:
 
 
 def _seconds_in_text(text: str, name: str) -> float:
-    # Both signs of micro, that of keyboards and the Greek letter, are spelled with a u.
-    parts = _TEXT.fullmatch(text.replace("\u00b5", "u").replace("\u03bc", "u"))
+    spelled = text.translate(dict.fromkeys(map(ord, MICRO_SIGNS), "u"))
+    parts = _TEXT.fullmatch(spelled)
     unit = "s" if parts is None or parts[2] is None else parts[2]
     try:
         return math.nan if parts is None else number_in_text(parts[1]) * SECONDS_IN_UNIT[unit]

@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, require_mapping
+from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.plants.dae_functions import BUTCHER
 from obsynth.plants.signal_names import index_of
 
@@ -107,8 +108,7 @@ class SensorNoise:
 
 def seconds(value: Any, path: str) -> float:
     """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
-    # Both signs of micro, that of keyboards and the Greek letter, are spelled with a u.
-    text = re.sub("[\u00b5\u03bc]s", "us", value) if isinstance(value, str) else ""
+    text = re.sub(f"[{''.join(MICRO_SIGNS)}]s", "us", value) if isinstance(value, str) else ""
     match = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", text)
     if match is not None and match[2] in SECONDS_OF_UNITS:
         try:

@@ -39,6 +39,7 @@ from obsynth.numerics.arguments import (
     is_number,
     problem_with,
 )
+from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.specs.quantities import QUANTITY
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
@@ -60,9 +61,7 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 #: By what a number in each unit is multiplied, then divided, for seconds: 1.1 ms are 0.0011 s to the last digit.
 _SECONDS = {
     "us": (1.0, 1e6),
-    # The sign of keyboards, and the letter of the Greek alphabet.
-    "\u00b5s": (1.0, 1e6),
-    "\u03bcs": (1.0, 1e6),
+    **{f"{sign}s": (1.0, 1e6) for sign in MICRO_SIGNS},
     "ms": (1.0, 1e3),
     "s": (1.0, 1.0),
     "min": (60.0, 1.0),

@@ -16,7 +16,7 @@ from obsynth.monitoring.logs.log_observer import LogObserver
 from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.measurement_units import conversion
+from obsynth.numerics.measurement_units import MICRO_SIGNS, conversion
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
 from obsynth.plants.signal_names import suggestion
 
@@ -224,7 +224,7 @@ def column_of(header: Sequence[str], name: str) -> str | None:
 
 def _one_spelling(name: str) -> str:
     """Return a name in one of its encodings: letters with their marks as one code point, the sign for micro as mu."""
-    return name if name.isascii() else unicodedata.normalize("NFC", name).replace("\u00b5", "\u03bc")
+    return name if name.isascii() else unicodedata.normalize("NFC", name).replace(*MICRO_SIGNS)
 
 
 def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.plants.input_derivatives import derivative_of
 
 #: What a missing sample may look like in a log.
@@ -79,7 +80,7 @@ _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 _UNITS_OF_TIME = {
     **dict.fromkeys(("", "-", "s", "sec", "secs", "second", "seconds", "sek"), 1.0),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e3),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "microsecond", "microseconds"), 1e6),
+    **dict.fromkeys(("us", *(f"{sign}s" for sign in MICRO_SIGNS), "usec", "microsecond", "microseconds"), 1e6),
     **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e9),
     **dict.fromkeys(("min", "minute", "minutes"), 1 / 60),
     **dict.fromkeys(("h", "hr", "hour", "hours"), 1 / 3600),
