@@ -176,7 +176,9 @@ class LogSignals:
 
     def _first_of(self, missing: Sequence[str]) -> tuple[str, str]:
         """Return the first of these columns that is for a signal, and the signal; of the time where none is."""
-        signals = dict(zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.one), strict=True))
+        signals = dict(
+            zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.constant_signal), strict=True)
+        )
         return next(((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER))
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
