@@ -69,9 +69,9 @@ def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> V
     >>> plant = obsynth.uncertain_system(
     ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
     ... )
-    >>> found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    >>> margins = obsynth.robustness(obsynth.fault_estimation_filter(plant))
     >>> with TemporaryDirectory() as folder:
-    ...     _ = found.save(f"{folder}/robust.json")
+    ...     _ = margins.save(f"{folder}/robust.json")
     ...     print(obsynth.verify_certificate(f"{folder}/robust.json").passed)
     True
     """

@@ -221,8 +221,8 @@ def compare(
     ...     dt=1.0,
     ...     sensor_noise={"y1": 0.1, "y2": 0.1},
     ... )
-    >>> found = obsynth.compare(plant, methods=["fault-estimation-filter", "ui-pi-observer"], runs=2)
-    >>> found.recommended in ("fault-estimation-filter", "ui-pi-observer")
+    >>> comparison = obsynth.compare(plant, methods=["fault-estimation-filter", "ui-pi-observer"], runs=2)
+    >>> comparison.recommended in ("fault-estimation-filter", "ui-pi-observer")
     True
     """
     made = linear_plant(plant)

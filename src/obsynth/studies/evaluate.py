@@ -213,8 +213,8 @@ def evaluate(
     ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
     ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
     ... )
-    >>> found = obsynth.evaluate(design, scenario, runs=20, monitor=obsynth.monitor(design, scenario))
-    >>> found.false_alarm_rate.value, found.detection_delay.value
+    >>> rates = obsynth.evaluate(design, scenario, runs=20, monitor=obsynth.monitor(design, scenario))
+    >>> rates.false_alarm_rate.value, rates.detection_delay.value
     (0.0, 1.0)
     """
     runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))

@@ -138,8 +138,8 @@ def region_trade_off(
     ...     },
     ...     scheduling={"v": [-1.0, 1.0]},
     ... )
-    >>> found = obsynth.region_trade_off(plant, sizes=[0.5, 1.0])
-    >>> bool((found.reached <= found.claims).all())
+    >>> trade_off = obsynth.region_trade_off(plant, sizes=[0.5, 1.0])
+    >>> bool((trade_off.reached <= trade_off.claims).all())
     True
     """
     if sizes is not None and rates is not None:

@@ -104,8 +104,8 @@ def robustness(
     >>> plant = obsynth.uncertain_system(
     ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
     ... )
-    >>> found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
-    >>> found.stable
+    >>> margins = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    >>> margins.stable
     'proved'
     """
     design, plant = with_tolerances(design, constants)

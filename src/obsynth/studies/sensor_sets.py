@@ -224,8 +224,8 @@ def sensor_sets(
     >>> plant = obsynth.DescriptorSystem(
     ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0, state_names=["a", "b"]
     ... )
-    >>> found = obsynth.sensor_sets(plant, goal="estimate-step")
-    >>> [item.sensors for item in found.sets]
+    >>> additions = obsynth.sensor_sets(plant, goal="estimate-step")
+    >>> [item.sensors for item in additions.sets]
     [('b',)]
     """
     plant = linear_plant(plant)

@@ -223,8 +223,8 @@ def sweep(
     ...     dt=1.0,
     ...     sensor_noise={"y1": 0.1, "y2": 0.1},
     ... )
-    >>> found = obsynth.sweep(plant, {"decay": [0.2, 0.5]}, method="ui-pi-observer")
-    >>> [result.status for result in found.results]
+    >>> grid = obsynth.sweep(plant, {"decay": [0.2, 0.5]}, method="ui-pi-observer")
+    >>> [result.status for result in grid.results]
     ['designed', 'designed']
     """
     made = _cases(cases, parameters or {}, method)

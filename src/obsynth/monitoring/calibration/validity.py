@@ -160,8 +160,8 @@ def validity(
     ... )
     >>> linear = obsynth.linearise(tank, given={"inflow": 0.5})
     >>> log = {"time": np.arange(20), "inflow": 0.5 + 0.1 * (np.arange(20) > 5), "gauge": np.ones(20)}
-    >>> found = obsynth.validity(tank, linear, log, deviations={"gauge": 0.01})
-    >>> round(found.largest, 2)  # in deviations of the sensors
+    >>> region = obsynth.validity(tank, linear, log, deviations={"gauge": 0.01})
+    >>> round(region.largest, 2)  # in deviations of the sensors
     3.0
     """
     names = {*linear.input_names, *linear.disturbance_names} - {DRIFT}

@@ -234,8 +234,8 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
     ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
     ... )
-    >>> found = obsynth.monitor(design, scenario).watch(obsynth.simulate(design, scenario).estimates)
-    >>> obsynth.plotting.plot_detection(found, dt=1.0).get_xlabel()
+    >>> detection = obsynth.monitor(design, scenario).watch(obsynth.simulate(design, scenario).estimates)
+    >>> obsynth.plotting.plot_detection(detection, dt=1.0).get_xlabel()
     'time (s)'
     """
     panel = one_panel(axes)
