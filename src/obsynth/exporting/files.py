@@ -1,4 +1,4 @@
-"""Writing a gain set for other programs."""
+"""The public `export` of a design: the kind of file by its suffix, and the options that each kind takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every export holds: one discrete- or continuous-time realisation, its names, and the digest of the gain set."""
+"""The realisation that an export holds, discrete or continuous in time, with its names and the gain set's digest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Certificates of any kind verified to the end of what they rest on, without a solver."""
+"""Verification of certificate files of any kind, and of all files that they rest on, without a solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a design promises for every plant in the box of its constants."""
+"""Robust stability and bounds of a design for every plant in the box of its constants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Much work on any executor: what is there already is not done again, results are kept in a folder and make a table."""
+"""Cases run on any executor: results are kept in a folder, finished cases are not run again, and all make a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a log says of each constant: information, directions it does not determine, and boxes by profile likelihood."""
+"""Information of a log on the constants: directions that it does not determine, and boxes by profile likelihood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a calibration needs of a plant: one implicit step and the outputs as CasADi functions of unknown constants."""
+"""Plants in a calibration: one implicit step and the outputs as CasADi functions of unknown constants."""
 
 from __future__ import annotations
 

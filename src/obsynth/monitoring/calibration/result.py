@@ -1,4 +1,4 @@
-"""What a calibration found, frozen, with a table for people and plain data for programs."""
+"""The result of a calibration, frozen, with a table for people and plain data for programs."""
 
 from __future__ import annotations
 

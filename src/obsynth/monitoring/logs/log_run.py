@@ -1,4 +1,4 @@
-"""What runs a log: rows of data to rows of output, what is counted, and the saved state with which it goes on."""
+"""A run over a log: rows of data to rows of output, counts of what happened, and the saved state to resume from."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What disturbances of any time course do to the residual of a continuous design at the samples of its data, from
-above.
+"""Bounds on the effect of disturbances that move between samples on the residual of a continuous design.
 
 The observer takes outputs as straight lines, which the plant does not follow.  x enters the error by what these miss of
 a free motion, as far as it decays: the other modes leave rounding, or there is no bound.

@@ -1,4 +1,4 @@
-"""By how much a pointwise bound grows after missing outputs: what the plant's model, which stood in, may have missed.
+"""Growth of a pointwise bound after missing outputs: the error of the plant's model, which replaced them.
 
 At the last complete row its states and faults are off by ``zeta = S e + S_q q`` (inputs q of the plant, each at most
 one); after j rows without outputs these are off by ``M^j zeta - sum M^l [Bq; 0] q``, ``M = [A Bf; 0 I]``, so that the

@@ -1,4 +1,4 @@
-"""Rows without faults: what a design says of them, and the thresholds that are learned from that."""
+"""From logs without faults to learned thresholds: the observer runs on them, and its residuals are learned from."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What in rows without faults is to be looked at before a monitor is learned from them: events that raise the levels,
-outputs that are stuck, and residuals that are larger where inputs move.
-"""
+"""Notes on rows without faults: events that raise the levels, stuck outputs, residuals that grow where inputs move."""
 
 from __future__ import annotations
 

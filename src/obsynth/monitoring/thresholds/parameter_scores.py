@@ -1,4 +1,4 @@
-"""What each sample says of parameters that walk, from estimates and covariances alone, and whether one has changed.
+"""Score and information of each sample on parameters that walk, and likelihood ratios of a change of one of them.
 
 A filter follows a fault, and its innovations return to zero.  What a sample alone says of the parameters is what its
 update added to their information: ``J = P^-1 - M^-1`` and ``s = P^-1 theta - M^-1 theta_before``, with the covariance P

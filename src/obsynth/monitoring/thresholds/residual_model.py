@@ -1,4 +1,4 @@
-"""What reaches the residual of a design when nothing is wrong: ``e = V E x - z`` at the samples.
+"""The model of a residual without faults, driven by disturbances and noise: ``e = V E x - z`` at the samples.
 
 ``e+ = Phi e + Gamma d + w - By_h n``, ``r = -C e + Dd d + Dy_h n``, ``e(0) = V E x(0) - z(0) + Gamma_1 n(0)``: held
 d, process noise w gathered over an interval, sensor noise n.

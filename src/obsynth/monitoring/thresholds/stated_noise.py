@@ -1,4 +1,4 @@
-"""Bounds of the norm of a residual, or of a window of it: the paper's, and such as are never passed without a fault.
+"""Thresholds of the norm of a residual, or of a window of it: the paper's (66), and guaranteed bounds.
 
 For records of known length, and of any length: a table for the start, and one number for ever after.
 """

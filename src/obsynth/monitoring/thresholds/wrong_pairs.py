@@ -1,4 +1,4 @@
-"""Pairs of wrong samples in rows without faults: a gate believes the second, which the rows after it take back.
+"""Pairs of wrong samples in rows without faults, of which an outlier gate accepts the second and later rows refute it.
 
 A gate leaves the first sample of a fault out and believes the second.  Two wrong samples of one sensor in a row, as far
 off on one side, look the same; but once both are left out, the next sample is where it was predicted.  In rows without

@@ -1,4 +1,4 @@
-"""The verbs that take a gain set further: run on data, proved alarms, exports, pictures and pages."""
+"""The verbs that run a gain set on a log: ``run``, ``prove-alarm`` and ``plot``."""
 
 from __future__ import annotations
 

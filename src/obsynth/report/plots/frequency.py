@@ -1,4 +1,4 @@
-"""What reaches the estimates of faults and states, and the residual, at each frequency."""
+"""Frequency responses from faults, disturbances and noise to the estimates of faults and states and to the residual."""
 
 from __future__ import annotations
 
