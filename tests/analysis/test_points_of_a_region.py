@@ -102,3 +102,15 @@ def test_a_decay_of_a_nonlinear_plant_needs_no_samples_and_the_rest_says_what_is
         obsynth.conditions.region(model, {"x": [-1, 1]}, noise={"g": 1.0, "f": 1.0})
     with pytest.raises(SpecError, match="noise must name signals"):
         obsynth.conditions.region(model, {"x": [-1, 1]}, sample_time=1.0)
+
+
+def test_remedies_of_outputs_that_change_and_of_late_faults_work() -> None:
+    changing = {"A": [["a"]], "C": [["1 + a"]], "Bf": [[1]], "dt": 1.0}
+    with pytest.raises(PreconditionError, match=r"changing: C\. Divide a measurement by what scales its row"):
+        obsynth.fault_estimation_filter(PolytopicSystem(plant=changing, scheduling={"a": [0.1, 0.5]}))
+    quotient = PolytopicSystem(plant={**changing, "C": [[1]]}, scheduling={"a": [0.1, 0.5]})
+    assert obsynth.fault_estimation_filter(quotient).report.passed
+    late = hidden("v", {"v": [1, 2]}, 0.5, Bf=[[0], [1]])
+    with pytest.raises(PreconditionError, match=r"later: f1.*ui-pi-observer does not need it"):
+        obsynth.fault_estimation_filter(late)
+    assert obsynth.ui_pi_observer(late).report.passed

@@ -80,7 +80,10 @@ def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condi
         float(len(changing)),
         0.0,
         source,
-        f"changing: {', '.join(changing)}" if changing else "",
+        f"changing: {', '.join(changing)}. Divide a measurement by what scales its row, and write the quotient as the "
+        "output; an input's part may be subtracted from it"
+        if changing
+        else "",
         of_the_method=True,
     )
 
@@ -231,7 +234,9 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         float(len(late)),
         0.0,
         _SOURCE,
-        f"later: {', '.join(late)}; a filter for these over a region is not known here" if late else "",
+        f"later: {', '.join(late)}; a filter for these over a region is not known here. ui-pi-observer does not need it"
+        if late
+        else "",
         signals=tuple(late),
         of_the_method=True,
     )
