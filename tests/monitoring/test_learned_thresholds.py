@@ -34,7 +34,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.monitor import LinearSample, Sample
-from obsynth.monitoring.thresholds.watched_columns import watched_names
+from obsynth.monitoring.thresholds.watched_columns import settling_rows, watched_names
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.numerics.square_root_estimation import ParameterState
 from obsynth.observers.recursive.sample import RawEstimate
@@ -568,3 +568,16 @@ def test_an_alarm_is_not_ended_by_outputs_that_are_left_out() -> None:
     statistic = table["statistic"].to_numpy(dtype=float)
     assert np.isfinite(statistic[normal.settling :]).all()
     assert np.min(statistic[270:]) > 2.0
+
+
+def test_a_kalman_filter_decides_when_the_error_of_its_start_is_gone() -> None:
+    """The error decays as .5 ** k here: a thousandth is left of it after ten rows; a parameter has no such rate."""
+    matrices: dict[str, Any] = {"E": None, "A": [[0.5]], "C": [[1.0]], "dt": 1.0}
+    plain = obsynth.TimeVaryingDescriptorSystem(**matrices)
+    # Without noise of the state the gain tends to zero, and the error decays with the plant.
+    assert settling_rows(obsynth.descriptor_kalman(plain, Q=0.0, R=1.0)) == 10
+    slow = obsynth.TimeVaryingDescriptorSystem(**{**matrices, "A": [[0.999]]})
+    assert settling_rows(obsynth.descriptor_kalman(slow, Q=0.0, R=1.0)) == SETTLING
+    unknown = obsynth.TimeVaryingDescriptorSystem(**matrices, Phi=[[1.0]])
+    design = obsynth.adaptive_observer(unknown, Q=1e-4, R=1e-2, forgetting=0.95)
+    assert settling_rows(design) == SETTLING

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_filter import settled_contraction
 from obsynth.observers.running import changed
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.results.design import ObserverDesign
+
+#: Share of an error at the start of a run below which rows are like those that follow.
+START_LEFT = 1e-3
 
 
 def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
@@ -45,8 +50,20 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
 
 
 def settling_rows(design: ObserverDesign) -> int:
-    """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these."""
-    return 0 if isinstance(design.observer, (LinearObserver, RegionObserver, ScheduledObserver)) else SETTLING
+    """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these.
+
+    Of a Kalman filter whose gains tend to a steady state they are those in which the error at the start decays to
+    `START_LEFT` of itself.
+    """
+    observer = design.observer
+    if isinstance(observer, (LinearObserver, RegionObserver, ScheduledObserver)):
+        return 0
+    if not isinstance(observer, RecursiveObserver) or observer.fault_names:
+        return SETTLING
+    contraction = settled_contraction(observer)
+    if contraction is None or contraction >= 1.0:
+        return SETTLING
+    return min(SETTLING, math.ceil(math.log(START_LEFT) / math.log(max(contraction, START_LEFT))))
 
 
 def has_innovations_by_sensor(observer: Any) -> bool:
