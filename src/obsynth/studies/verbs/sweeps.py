@@ -6,7 +6,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
@@ -178,7 +178,19 @@ def _print_outcome(options: argparse.Namespace, outcome: Any, files: tuple[Path,
     console = stdout_console()
     printed = _printed_cases if unit == "cases" else _printed_runs
     console.print(printed(outcome, console.width))
+    if unit == "cases":
+        for case, status, message in _first_failures([dict(zip(header, row, strict=True)) for row in rows]):
+            console.print(f"{case}: {status}: {message}", soft_wrap=True, markup=False, highlight=False)
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+
+
+def _first_failures(cases: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return for each kind of failure the first case, its status and why it has no design."""
+    firsts: dict[str, tuple[str, str, str]] = {}
+    for case in cases:
+        if case["message"]:
+            firsts.setdefault(case["status"], (case["case"], case["status"], str(case["message"])))
+    return list(firsts.values())
 
 
 def usual_jobs(count: int) -> int:
