@@ -67,6 +67,9 @@ _SHIFTS = (1e-4, 1e-7, 1e-10, 1e-13)
 #: The inverse is given up where its residual is larger.
 _LARGEST_INVERSE_RESIDUAL = 0.5
 
+#: Bounds in the norm of a factor have ``1 / (1 - defect)`` of its inverse: above this they say little.
+_LARGEST_DEFECT = 0.5
+
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
 MOST_SUMMED_STEPS, LEFT_OF_SUM = 65_536, 1e-3
@@ -253,7 +256,7 @@ def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> C
     product = Ball.exact(factor) @ Ball.exact(inverse) - Ball.exact(np.eye(n))
     defect = product.frobenius_norm
     speed = largest_singular_value(factor @ ball.midpoint @ inverse)
-    return Contraction(factor, inverse, defect, rate, discrete, speed) if defect < 0.5 else None
+    return Contraction(factor, inverse, defect, rate, discrete, speed) if defect < _LARGEST_DEFECT else None
 
 
 def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:

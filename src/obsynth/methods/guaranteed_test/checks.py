@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.options import TestOptions
@@ -46,7 +47,6 @@ SOURCE = "duality of linear programmes; exact arithmetic on the shipped numbers"
 #: What certificates hold by programme, as wide as the widest; of a plant with constant matrices one row.
 BY_PROGRAMME = ("multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "thresholds", "leasts")
 
-
 #: Sums in another order differ by less than this share.
 SAME_SUM = 1e-12
 
@@ -56,16 +56,8 @@ PRODUCT_ROUNDINGS = 4.0
 
 def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptions]) -> Iterator[Check]:
     """Yield a row for each claim; ``read`` returns options that are checked."""
-    constant, problem, programmes, reason = isinstance(design.plant, DescriptorSystem), None, None, ""
-    try:
-        plant: Any = design.linear[0] if constant else design.plant
-        options = read(design.options)
-        if options.model is None:
-            require_linear_options(options)
-        problem = problem_as_designed(plant, options)
-        programmes = WindowProgrammes.of(problem, int(options.samples))
-    except (ObsynthError, TypeError, ValueError, AttributeError, ArithmeticError, LookupError) as error:
-        reason = str(error) or type(error).__name__
+    constant = isinstance(design.plant, DescriptorSystem)
+    problem, programmes, reason = _problem_of_options(design, read, constant=constant)
     yield upper_bound_check(
         "question",
         "the options ask a question about this plant",
@@ -88,35 +80,69 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
     of_row = shipped["programmes"].ravel().astype(np.int64)
     used = sorted(set(of_row[of_row >= 0].tolist()))
     if not constant:
-        misplaced = int(np.sum((of_row >= 0) & (of_row != programmes.of_row)))
-        yield upper_bound_check(
-            "rows",
-            "each row with a verdict has the programme of its own window",
-            float(misplaced) if used else np.inf,
-            0.0,
-            source=SOURCE,
-            kind="proved",
-        )
-        if misplaced or not used:
+        placed = _placed_row(of_row, programmes)
+        yield placed
+        if not placed.passed:
             return
-    tests = {}
-    for k in used:
-        rows = programmes.windows[k].rows
-        tests[k] = NearbySolution(shipped["multipliers"][k][:rows], shipped["multiplier_radius"][k][:rows])
+    tests = _shipped_tests(shipped, programmes, used)
     yield from _of_the_tests(design, shipped, programmes, tests, constant=constant)
     yield from _of_what_runs(design, shipped, problem, programmes, tests)
     yield from _of_the_least(design, shipped, problem, programmes, used, constant=constant)
     if "mean_threshold" in design.certificate.claims:
         yield _over_tolerances(design, programmes.windows[0], tests[0])
-    first = programmes.windows[used[0]]
+    delay = _delay(programmes.windows[used[0]], tests[used[0]]) * problem.plant.dt
     yield upper_bound_check(
         "delay",
         "a fault of the size that is certain to be detected raises an alarm after at most so many seconds"
         f"{'' if constant else ', at rows with a verdict'}",
-        delay_in_samples(first, first.weights(tests[used[0]].values)[2]) * problem.plant.dt,
+        delay,
         float(design.certificate.claims.get("delay", np.nan)),
         source=SOURCE,
     )
+
+
+def _problem_of_options(
+    design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptions], *, constant: bool
+) -> tuple[WindowProblem | None, WindowProgrammes | None, str]:
+    """Return the problem that the options state about the plant, and its programmes; or why there are none."""
+    try:
+        plant: Any = design.linear[0] if constant else design.plant
+        options = read(design.options)
+        if options.model is None:
+            require_linear_options(options)
+        problem = problem_as_designed(plant, options)
+        return problem, WindowProgrammes.of(problem, int(options.samples)), ""
+    except (ObsynthError, TypeError, ValueError, AttributeError, ArithmeticError, LookupError) as error:
+        return None, None, str(error) or type(error).__name__
+
+
+def _placed_row(of_row: NDArray[np.int64], programmes: WindowProgrammes) -> Check:
+    """Return the row that each row of a record has the programme of its own window; -1 is none."""
+    misplaced = int(np.sum((of_row >= 0) & (of_row != programmes.of_row)))
+    return upper_bound_check(
+        "rows",
+        "each row with a verdict has the programme of its own window",
+        float(misplaced) if np.any(of_row >= 0) else np.inf,
+        0.0,
+        source=SOURCE,
+        kind="proved",
+    )
+
+
+def _shipped_tests(
+    shipped: Mapping[str, FloatArray], programmes: WindowProgrammes, used: Sequence[int]
+) -> dict[int, NearbySolution]:
+    """Return the shipped multipliers of each programme that is used, with their distance from exact ones."""
+    tests = {}
+    for k in used:
+        rows = programmes.windows[k].rows
+        tests[k] = NearbySolution(shipped["multipliers"][k][:rows], shipped["multiplier_radius"][k][:rows])
+    return tests
+
+
+def _delay(window: Window, test: NearbySolution) -> int:
+    """Return the samples until a fault that is certain to be detected raises an alarm."""
+    return delay_in_samples(window, window.weights(test.values)[2])
 
 
 def _by_programme(design: ObserverDesign, *, constant: bool) -> dict[str, FloatArray]:

@@ -140,20 +140,7 @@ def _dynamic_rows(
         source="our finding",
         detail=f"at k = {ranks.directions_k}",
     )
-    in_batch = batch_steps(stated)
-    span = f"{in_batch} steps at once" + (
-        ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
-    )
-    for name, gap in batch_residuals(stated, observer).items():
-        yield upper_bound_check(
-            f"batch: {name}",
-            "the recursion equals the least-squares solution of the whole record",
-            gap,
-            BATCH_TOLERANCE * ranks.condition,
-            source=f"{SOURCE}, (6)-(10)",
-            kind="equality",
-            detail=span,
-        )
+    yield from _batch_rows(stated, observer, ranks.condition)
     # Where both hold the same matrices, they need not be recomputed.
     followed = facts.steps - int(observer.early_constraints)
     proof = horizon_proof(observer if same else stated, observer, followed, gains=gains)
@@ -164,24 +151,47 @@ def _dynamic_rows(
         yield from parameter_row(proof)
         yield from steady_rows(stated, design.gains, proof.last, ranks.condition)
     if observer.adaptation is not None:
-        yield information(
-            "excitation",
-            "least information on the parameters in a window",
-            facts.excitation,
-            source=f"{SOURCE}, (26)",
-            detail=f"window of {observer.adaptation.window} ends at k = {facts.excitation_k}",
-        )
-        for name, deviation in zip(observer.fault_names, facts.deviations, strict=True):
-            yield information(
-                f"noise in fhat[{name}]",
-                "standard deviation of the parameter after the last step",
-                float(deviation),
-                source="recomputed",
-                detail=observer.plant.units.get(name, ""),
-            )
+        yield from _parameter_information(observer, observer.adaptation.window, facts)
     yield listed_gains(design, {"L": facts.L, "K": facts.K}, tolerance=CLAIM_TOLERANCE)
     yield _claims(design, facts, ranks)
     yield from consistency(stated, observer, looked_at(observer), gains=gains)
+
+
+def _batch_rows(stated: RecursiveObserver, observer: RecursiveObserver, condition: float) -> Iterator[Check]:
+    """Yield the rows that the recursion is the least-squares solution; ``condition`` is that of H."""
+    in_batch = batch_steps(stated)
+    span = f"{in_batch} steps at once" + (
+        ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
+    )
+    for name, gap in batch_residuals(stated, observer).items():
+        yield upper_bound_check(
+            f"batch: {name}",
+            "the recursion equals the least-squares solution of the whole record",
+            gap,
+            BATCH_TOLERANCE * condition,
+            source=f"{SOURCE}, (6)-(10)",
+            kind="equality",
+            detail=span,
+        )
+
+
+def _parameter_information(observer: RecursiveObserver, window: int, facts: GainScheduleSummary) -> Iterator[Check]:
+    """Yield what the record tells about the parameters: the least information in a window, and their deviations."""
+    yield information(
+        "excitation",
+        "least information on the parameters in a window",
+        facts.excitation,
+        source=f"{SOURCE}, (26)",
+        detail=f"window of {window} ends at k = {facts.excitation_k}",
+    )
+    for name, deviation in zip(observer.fault_names, facts.deviations, strict=True):
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation of the parameter after the last step",
+            float(deviation),
+            source="recomputed",
+            detail=observer.plant.units.get(name, ""),
+        )
 
 
 def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> Check:
