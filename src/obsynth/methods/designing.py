@@ -215,8 +215,9 @@ def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery:
     alternatives = [
         other for other in methods_for(kind_of(plant)) if "steady_error_limit" in field_types(method_class(other))
     ]
+    limit = {name: value for name, value in method.as_given().items() if name == "steady_error_limit"}
     for other in (other for other in alternatives if other != method.id):
-        known = method_class(other).of({"steady_error_limit": method.as_given()["steady_error_limit"]})
+        known = method_class(other).of(limit)
         try:
             trial = _designed(plant, known, name=name, recovery=recovery, progress=silent, advise=False)
         except ObsynthError:

@@ -61,30 +61,37 @@ def rounding_in_operation(observer: LinearObserver, kept: np.ndarray, y: FloatAr
         parts = {"By": observer.By[kept], "Bu": observer.Bu[kept], "Cz": observer.Cz[:, kept]}
         part = replace(observer, Az=observer.Az[np.ix_(kept, kept)], **parts)
     az, by = np.abs(part.Az), np.abs(part.By)
-    contraction = contraction_of(part)
+    contraction, entries = contraction_of(part), inverse_bound(az)
     unknown = np.full((len(cz), y.shape[1]), np.inf)
     if contraction is None:
         return unknown
     local = rounded_up(unit * (az @ z + by @ y), 2 * count)
-    added = _of_the_state(part, contraction, unit, local)
+    added = _of_the_state(part, contraction, entries, unit, local)
     if added is None:
         return unknown
     sums = absolute_gains(part.Az, part.Cz[rows], contraction)
+    if entries is not None:
+        sums = np.minimum(sums, rounded_up(cz @ entries, 2 * count))
     driven = rounded_up(local + unit * (az @ added), 2 * count)
     through = rounded_up(unit * (cz @ (z + added) + dy @ y), 2 * count)
     return rounded_up(sums @ driven + through, 2 * count)
 
 
 def _of_the_state(
-    observer: LinearObserver, contraction: Contraction, unit: float, local: FloatArray
+    observer: LinearObserver, contraction: Contraction, entries: FloatArray | None, unit: float, local: FloatArray
 ) -> FloatArray | None:
-    """Return bounds on what rounding adds to the state ``(n, m)``, which is rounded again; ``None`` without a proof."""
+    """Return bounds on what rounding adds to the state ``(n, m)``, which is rounded again; ``None`` without a proof.
+
+    ``entries``: ``sum_k |Az|^k``, where it is finite: of delays in a chain it is exact, and no norm contracts much."""
     identity = np.eye(observer.order)
-    for closely in (False, True):
-        if closely and observer.order > STATES_FOR_OWN_SUMS:
-            return None
-        sums = absolute_gains(observer.Az, identity, contraction) if closely else contraction.gain(identity, identity)
+
+    def bound(sums: FloatArray) -> FloatArray | None:
         again = inverse_bound(rounded_up(unit * (sums @ np.abs(observer.Az)), 2 * len(sums) + 2))
-        if again is not None:
-            return rounded_up(again @ (sums @ local), 4 * len(sums) + 4)
-    return None
+        return None if again is None else rounded_up(again @ (sums @ local), 4 * len(sums) + 4)
+
+    bounds = [bound(sums) for sums in (contraction.gain(identity, identity), entries) if sums is not None]
+    proved = [each for each in bounds if each is not None]
+    if not proved and observer.order <= STATES_FOR_OWN_SUMS:
+        closely = bound(absolute_gains(observer.Az, identity, contraction))
+        proved = [] if closely is None else [closely]
+    return np.minimum.reduce(proved) if proved else None
