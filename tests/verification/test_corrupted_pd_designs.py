@@ -103,6 +103,10 @@ def good(name: str) -> ObserverDesign:
 # Ways to corrupt a design.
 
 
+def asked(**changes: object) -> Corruption:
+    return lambda design: design.replace(options={**design.options, **changes})
+
+
 def plant_entry(name: str, row: int, column: int, by: float = 1e-6) -> Corruption:
     return lambda design: with_plant(design, **{name: nudged(getattr(design.plant, name), row, column, by)})
 
@@ -287,6 +291,8 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "delta NaN": ("paper", claim("delta", np.nan), (FITS,)),
     "decay too fast": ("paper", claim_beside("decay", ERRORS, -1.0 - 1e-9), (DECAY, LMI)),
     "decay too fast, second theorem": ("second theorem", claim_beside("decay", ERRORS, -1.0 - 1e-9), (DECAY, LMI)),
+    "asked for more": ("bounds", asked(gain_bound=6.0, decay=500.0), ("requested bounds", "requested decay")),
+    "asked for nonsense": ("bounds", asked(engine="none"), ("options",)),
     "decay infinite": ("bounds", claim("decay", np.inf), (FITS,)),
     "decay negative": ("paper", claim("decay", -1.0), (FITS,)),
     "decay missing": ("paper", without_claim("decay"), (FITS,)),

@@ -95,6 +95,10 @@ def good(name: str) -> ObserverDesign:
 # Ways to corrupt a design.
 
 
+def asked(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: design.replace(options={**design.options, **changes})
+
+
 def observer_change(change: Callable[[object], dict]) -> Callable[[ObserverDesign], ObserverDesign]:
     return lambda design: design.replace(observer=dataclasses.replace(design.observer, **change(design.observer)))
 
@@ -209,6 +213,10 @@ def like_the_disturbance(fault: int) -> Callable[[ObserverDesign], ObserverDesig
 #: What is corrupted -> (good design, corruption, exactly the rows that fail).
 TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
     "By in the last digits, of a slow plant": ("slow", last_digits, ("constant fault",)),
+    # The options.
+    "faster than it is": ("slow", asked(decay=1e3), ("requested decay",)),
+    "other poles": ("fixed", asked(poles=[-3, -3, -4]), ("requested poles",)),
+    "another region": ("direct", asked(region={"decay": 1e3}), ("requested region",)),
     # One entry of the observer.
     "Az": ("paper", entry("Az", 1, 1, 1e-5), (SYLVESTER, POLES, DECOUPLING)),
     "Az of a fixed mode": ("fixed", entry("Az", 2, 2, 1e-5), (SYLVESTER, DECOUPLING)),

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.scheduled.observer import ScheduledObserver
     from obsynth.observers.window.observer import WindowObserver
+    from obsynth.verification.requested_limits import Limits
 
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear", "polytopic"]
@@ -112,6 +113,8 @@ class Method(ABC):
     over_scenario: ClassVar[bool] = False
     #: Whether its designs are models without feedback: nothing is claimed of their stability, as the verdict says.
     open_loop: ClassVar[bool] = False
+    #: Which of the options decay, region and poles are about the eigenvalues of its linear observers.
+    placed: ClassVar[frozenset[str]] = frozenset()
     #: Values of required options, for questions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
 
@@ -180,6 +183,16 @@ class Method(ABC):
         package = cls.__module__.rpartition(".")[0]
         rows: Iterator[Check] = import_module(f"{package}.checks").checks(design, printed_digits)
         return rows
+
+    @classmethod
+    def requested_limits(cls, design: ObserverDesign) -> Limits:
+        """Return, by option, which claims of a design it bounds: `verify` compares them."""
+        return {}
+
+    @classmethod
+    def fixed_modes(cls, design: ObserverDesign) -> tuple[complex, ...]:
+        """Return the eigenvalues of a linear observer that no gain moves, which the option decay is not about."""
+        return ()
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:

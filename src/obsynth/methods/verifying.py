@@ -12,7 +12,7 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, field_types, is_number, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.results.checks import Check, upper_bound_check
+from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
@@ -21,6 +21,7 @@ from obsynth.verification.error_system import error_model_row
 from obsynth.verification.over_tolerances.rows import tolerance_rows
 from obsynth.verification.plant import condition_rows, derivation_rows, stored_twice_rows
 from obsynth.verification.platform import platform_rows
+from obsynth.verification.requested_limits import requested_rows
 from obsynth.verification.stored_numbers import stored_number_rows
 
 #: The package whose methods prove decay by rows of their own, which its tests break one by one.
@@ -87,6 +88,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
                 rows = (*rows, *_constant_fault_rows(method, shipped, printed_digits))
         if all(row.passed for row in rows):
             rows = (*rows, *stored_twice_rows(shipped), *tolerance_rows(shipped))
+            if own:
+                rows = (*rows, *_option_rows(method, shipped))
         covered = {name: meaning.row for name, meaning in method.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))
@@ -122,6 +125,24 @@ def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple
         return
     names = {row.name for row in known}
     yield from (row for row in condition_rows(conditions) if row.name not in names)
+
+
+def _option_rows(method: type[Method], design: ObserverDesign) -> Iterator[Check]:
+    """Yield the rows on the options, with which a design is printed: they can be read, and what they ask for holds.
+
+    Recursive and nonlinear observers hold options in forms of their own, which the checks of these methods read.
+    """
+    # Of functions their names alone are stored.
+    fields = field_types(method).keys() - {"constraints", "objective"}
+    stored = {name: value for name, value in design.options.items() if name in fields}
+    try:
+        if isinstance(design.observer, LinearObserver):
+            method.of(stored)
+    except SpecError as error:
+        reasons = [str(problem) for problem in error.problems] or [str(error)]
+        yield nothing_wrong("options", "the options are those of the method", reasons, source="options")
+        return
+    yield from requested_rows(design, method.requested_limits(design), method.placed, method.fixed_modes)
 
 
 def _own_rows(method: type[Method], design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

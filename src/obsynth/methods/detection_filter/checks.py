@@ -71,6 +71,7 @@ def _fits(design: ObserverDesign) -> bool:
         and observer.dt == plant.dt == 0.0
         and 0.0 <= band[0] < band[1]
         and list(design.options.get("band", ())) == band
+        and band[0] <= float(claims.get("frequency", band[0])) <= band[1]
         and float(claims["disturbance_gain"]) > 0.0
         and float(claims["fault_sensitivity"]) >= 0.0
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge
 
@@ -28,6 +28,9 @@ from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES
 from obsynth.verification.over_region import DECAY_ROW, WITNESSES
+
+if TYPE_CHECKING:
+    from obsynth.verification.requested_limits import Limits
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
@@ -166,6 +169,7 @@ class FaultEstimationFilter(Method):
     }
     witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking", *WITNESSES}
     averaged: ClassVar[bool] = True
+    placed: ClassVar[frozenset[str]] = frozenset({"decay", "region"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
     gamma: Positive | None = None
@@ -258,6 +262,16 @@ class FaultEstimationFilter(Method):
             for label, value in (("gamma", checked_value(gamma, "gamma", Positive)), ("1 / gamma", 1.0 / gamma)):
                 require_no_overflow(value, label, "gamma")
         return synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
+
+    @classmethod
+    def requested_limits(cls, design: ObserverDesign) -> Limits:
+        """Return that gamma bounds the gain from disturbances, and decay over a region the factor of a sample."""
+        limits: Limits = {"gamma": (("gamma", "at most"),)} if "gamma" in design.certificate.claims else {}
+        return (
+            {**limits, "decay": (("region_decay", "factor"),)}
+            if "region_decay" in design.certificate.claims
+            else limits
+        )
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:

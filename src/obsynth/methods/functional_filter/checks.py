@@ -195,8 +195,31 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield equality(
             name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, TRACKING_TOLERANCE)
         )
+    yield from _mean_rows(design)
     yield from decoupling_rows(design)
     yield from noise_rows(design)
+
+
+def _mean_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the row that estimates are means: of the last m, what the filter makes of any signal is divisible by
+    ``1 + 1/z + ... + 1/z^(m-1)``, whose zeros are the m-th roots of unity but one."""
+    observer, mean = design.linear[1], design.options.get("mean", 1)
+    if mean == 1 or not observer.fault_names:
+        return
+    rows = observer.fault_rows
+    entering, direct = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])[rows]
+    missed, size = 0.0, float(np.max(np.abs(direct), initial=0.0))
+    for root in np.exp(2j * np.pi * np.arange(1, int(mean)) / int(mean)):
+        states = np.linalg.solve(root * np.eye(observer.order) - observer.Az, entering)
+        size = max(size, float(np.max(np.abs(observer.Cz[rows]) @ np.abs(states), initial=0.0)))
+        missed = max(missed, float(np.max(np.abs(observer.Cz[rows] @ states + direct), initial=0.0)))
+    yield upper_bound_check(
+        "mean",
+        f"each fault estimate is a mean of the last {mean}: at the roots of unity it shows nothing",
+        missed,
+        DECOUPLING_LEVEL * size,
+        source="computed from the transfer function of the filter",
+    )
 
 
 def _fits(design: ObserverDesign) -> bool:

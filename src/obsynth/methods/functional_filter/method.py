@@ -130,6 +130,8 @@ class FunctionalFilter(Method):
     )
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "faults under the weakest conditions"})
 
+    placed: ClassVar[frozenset[str]] = frozenset({"decay", "poles"})
+
     faults: Annotated[Any, WrittenAs("texts")] = None
     joint: bool = False
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"

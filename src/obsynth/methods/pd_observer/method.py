@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
+
+if TYPE_CHECKING:
+    from obsynth.verification.requested_limits import Limits
 
 #: Up to so many unknown states "auto" takes the inequality (a second or two); up to so many it tries it where the
 #: closed form does not serve (a minute or two).
@@ -152,6 +155,7 @@ class PdObserver(Method):
     witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
     imposed: ClassVar[frozenset[str]] = frozenset({"decay"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
+    placed: ClassVar[frozenset[str]] = frozenset({"decay", "region"})
 
     theorem: Literal[1, 2] = 1
     delta: Positive | None = None
@@ -242,6 +246,19 @@ class PdObserver(Method):
 
         gains = {"J": J, "L": L, "M": M, "N": N}
         return synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
+
+    @classmethod
+    def requested_limits(cls, design: ObserverDesign) -> Limits:
+        """Return what bounds its claims: rates, the disk, gains, and the range of the adaptation gain."""
+        return {
+            "theorem": (("theorem", "equal"),),
+            "decay": (("decay", "at least"),),
+            "disk": (("disk_centre", "equal"), ("disk_radius", "at most")),
+            "gain_bound": (("gain_bound", "at most"),),
+            "fault_rate_gain": (("fault_rate_gain", "at most"),),
+            "noise_gain": (("noise_gain", "at most"),),
+            "adaptation_range": (("adaptation_low", "at most"), ("adaptation_high", "at least")),
+        }
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.conditions.options import SolverName, SolverOptions
@@ -19,6 +19,10 @@ from obsynth.verification.over_region import (
     REGION_GAIN_ROW,
     WITNESSES,
 )
+
+if TYPE_CHECKING:
+    from obsynth.results.design import ObserverDesign
+    from obsynth.verification.requested_limits import Limits
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,11 @@ class RegionObserverMethod(Method):
         from obsynth.analysis.existence.nonlinear_region import region_conditions
 
         return region_conditions(plant, self.region, self.fault_names(plant))
+
+    @classmethod
+    def requested_limits(cls, design: ObserverDesign) -> Limits:
+        """Return that decay bounds the rate over the region."""
+        return {"decay": (("region_decay", "at least"),)}
 
     def fault_names(self, plant: DAEModel) -> tuple[str, ...]:
         """Return the parameters that are estimated."""

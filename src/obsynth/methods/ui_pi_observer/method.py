@@ -25,6 +25,7 @@ from obsynth.verification.over_region import DECAY_ROW, GAIN_WITNESSES, REGION_G
 
 if TYPE_CHECKING:
     from obsynth.methods.engines.region import Region
+    from obsynth.verification.requested_limits import Limits
 
 
 #: What to make of the freedom that poles leave.
@@ -154,6 +155,8 @@ class UiPiObserver(Method):
         {"tracking", "Phi", "Cw", "poles", "stability", *WITNESSES, *GAIN_WITNESSES}
     )
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
+
+    placed: ClassVar[frozenset[str]] = frozenset({"decay", "region", "poles"})
 
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
     poles: Annotated[Any, WrittenAs("poles")] = None
@@ -285,6 +288,23 @@ class UiPiObserver(Method):
         from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains
 
         return synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
+
+    @classmethod
+    def requested_limits(cls, design: ObserverDesign) -> Limits:
+        """Return that decay bounds what is claimed over a region."""
+        if "region_decay" not in design.certificate.claims:
+            return {}
+        return {"decay": (("region_decay", "factor" if design.observer.dt > 0.0 else "at least"),)}
+
+    @classmethod
+    def fixed_modes(cls, design: ObserverDesign) -> tuple[complex, ...]:
+        """Return the eigenvalues that no gain moves: zeros of the plant from the unknown inputs to the outputs."""
+        from obsynth.analysis.existence.augmented_pencils import shipped_model
+        from obsynth.analysis.existence.sharepasand import existence
+
+        plant, _ = design.linear
+        model = shipped_model(design.certificate.matrices, plant.nf)
+        return tuple(complex(mode) for mode in existence(plant, model).fixed_modes)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:

@@ -1,0 +1,195 @@
+"""What the options of a design ask for in numbers, against what its stored numbers reach: decay, region, poles, gains.
+
+A design that is read from a file is printed with its options.  A rate, a region or a gain that was asked for and is not
+reached would be read as if it were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
+from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.eigenstructure import as_pole
+from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
+from obsynth.numerics.spectra import mean_miss
+from obsynth.observers.linear.modes import poles_of
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
+from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.claims import claimed
+from obsynth.verification.inequalities import decay_row
+
+#: Which side of a claim an option bounds; a factor is that by which errors decay in a sample.
+Bound: TypeAlias = Literal["at least", "at most", "equal", "factor"]
+
+#: For an option, the claim that it bounds; of a list of numbers, one for each.
+Limits: TypeAlias = Mapping[str, tuple[tuple[str, Bound], ...]]
+
+#: Poles may be outside a region by this share of the terms of its inequality, and miss those asked for by this share
+#: of their size: they were placed, and found again, in double precision.
+POLE_TOLERANCE = 1e-4
+
+#: Claims may miss what was asked for by this share: the two are compared in the units of different coordinates.
+CLAIM_TOLERANCE = 1e-6
+
+#: What a region is by name, as `obsynth.ui_pi_observer` takes it.
+_NAMED = ("decay", "radius", "damping")
+
+_SOURCE = "options, and the stored numbers"
+
+
+def requested_rows(
+    design: ObserverDesign,
+    limits: Limits,
+    placed: frozenset[str],
+    fixed_modes: Callable[[ObserverDesign], Sequence[complex]],
+) -> Iterator[Check]:
+    """Yield a row for each number that the options ask for.
+
+    ``placed`` holds which of decay, region and poles are about the eigenvalues of the observer; ``fixed_modes`` returns
+    those that no gain moves.
+    """
+    options, observer = design.options, design.observer
+    asked = {name: bounds for name, bounds in limits.items() if options.get(name) is not None}
+    if asked:
+        wrong = [text for name, bounds in asked.items() for text in _beyond(design, name, bounds)]
+        yield nothing_wrong(
+            "requested bounds", f"what is claimed is within {', '.join(asked)} of the options", wrong, source=_SOURCE
+        )
+    if not isinstance(observer, LinearObserver) or not observer.order:
+        return
+    decay, region, poles = (options.get(name) if name in placed else None for name in ("decay", "region", "poles"))
+    rate = float(decay) if decay is not None and is_number(decay) else 0.0
+    if rate > 0.0:
+        yield _decay_row(observer, rate, fixed_modes(design))
+    try:
+        where = None if region is None else region_of(region, observer.dt)
+        readings = [] if poles is None else _readings(poles)
+    except (SpecError, TypeError, ValueError) as error:
+        yield nothing_wrong("requested poles", "region and poles are readable", [str(error)], source=_SOURCE)
+        return
+    if where is not None:
+        yield _region_row(_movable(_poles(observer), fixed_modes(design)), where)
+    if readings:
+        values = _poles(observer)
+        missed = min(mean_miss(_nearest(values, wanted), wanted, observer.dt) for wanted in readings)
+        yield upper_bound_check(
+            "requested poles",
+            "the poles of the options are among those of the observer, each within this share of its size",
+            missed,
+            POLE_TOLERANCE,
+            source=_SOURCE,
+        )
+
+
+def region_of(region: Any, dt: float) -> LMIRegion | None:
+    """Return the region of an option: by name (decay, radius, damping), by its matrices, or as `checked_region` takes
+    it."""
+    if isinstance(region, Mapping) and region.keys() == {"L", "M"}:
+        return LMIRegion(np.array(region["L"], dtype=float), np.array(region["M"], dtype=float), "the region")
+    if not isinstance(region, Mapping) or not set(region) <= set(_NAMED):
+        return checked_region(region)
+    stated: dict[str, Any] = dict(region)
+    parts = []
+    rate, radius, damping = (_number(stated.get(name)) for name in _NAMED)
+    if rate:
+        parts.append(disk(0.0, float(np.exp(-rate * dt))) if dt > 0.0 else half_plane(rate))
+    if radius is not None:
+        parts.append(disk(0.0, radius))
+    if damping is not None:
+        parts.append(sector(damping))
+    return reduce(lambda one, other: one & other, parts) if parts else None
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], ...]) -> Iterator[str]:
+    """Yield what is claimed and is not within an option."""
+    claims, value = design.certificate.claims, design.options[name]
+    numbers = list(value) if isinstance(value, (list, tuple)) else [value]
+    if len(numbers) != len(bounds) or not all(map(is_number, numbers)):
+        yield f"{name} is not {len(bounds)} number{'s' if len(bounds) > 1 else ''}"
+        return
+    for number, (claim, bound) in zip(map(float, numbers), bounds, strict=True):
+        reached = claimed(claims, claim)
+        if bound == "factor":  # of a rate, in a sample
+            number, bound = float(np.exp(-number * design.observer.dt)), "at most"
+        slack = CLAIM_TOLERANCE * abs(number)
+        holds = {
+            "at least": reached >= number - slack,
+            "at most": reached <= number + slack,
+            "equal": abs(reached - number) <= slack,
+        }[bound]
+        if not holds:
+            yield f"{claim} {reached:.6g}, where {name} asks for {bound} {number:.6g}"
+
+
+def _decay_row(observer: LinearObserver, rate: float, fixed: Sequence[complex]) -> Check:
+    """Return the row that all modes but the fixed ones decay at a rate."""
+    row = decay_row(observer, rate)
+    claim = "every mode decays at the rate (1/s) of the option decay, or faster"
+    if row.passed or not len(fixed):
+        return replace(row, name="requested decay", claim=claim)
+    # By the shape of the region: a mode that is fixed may be slower.
+    region = disk(0.0, float(np.exp(-rate * observer.dt))) if observer.dt > 0.0 else half_plane(rate)
+    inside = _region_row(_movable(_poles(observer), fixed), region)
+    return replace(inside, name="requested decay", claim=f"{claim}, but for the {len(fixed)} that no gain moves")
+
+
+def _region_row(values: ComplexArray, region: LMIRegion) -> Check:
+    """Return the row that poles lie in a region, relative to the terms of its inequality."""
+    size = np.linalg.norm(region.L, 2) + 2.0 * np.abs(values) * np.linalg.norm(region.M, 2)
+    outside = float(np.max(-region.margins(values) / np.where(size > 0.0, size, 1.0), initial=-1.0))
+    return upper_bound_check(
+        "requested region",
+        f"the poles that a gain moves lie in {region}: the farthest outside, relative to the terms",
+        outside,
+        POLE_TOLERANCE,
+        source=_SOURCE,
+    )
+
+
+def _poles(observer: LinearObserver) -> ComplexArray:
+    """Return the poles, with more digits than double precision gives where that is practical."""
+    enclosed = enclosed_eigenvalues(observer.Az)
+    if enclosed is None:
+        return poles_of(observer)
+    return np.array([middle_of(ball) for ball in enclosed], dtype=np.complex128)
+
+
+def _movable(values: ComplexArray, fixed: Sequence[complex]) -> ComplexArray:
+    """Return the poles without those nearest to the fixed ones."""
+    left = np.asarray(values, dtype=np.complex128)
+    for mode in fixed:
+        if left.size:
+            left = np.delete(left, int(np.argmin(np.abs(left - mode))))
+    return left
+
+
+def _nearest(values: ComplexArray, wanted: Sequence[complex]) -> ComplexArray:
+    """Return, of the poles, one for each wanted: nearest in sum."""
+    from scipy.optimize import linear_sum_assignment
+
+    chosen = linear_sum_assignment(np.abs(np.subtract.outer(values, np.asarray(wanted))))[0]
+    return np.asarray(values[chosen])
+
+
+def _readings(poles: Any) -> list[list[complex]]:
+    """Return what a list of poles may mean: a pair of numbers is one pole, or the two of one of several filters."""
+    pairs, lists = list[complex](), list[complex]()
+    for entry in poles:
+        several = isinstance(entry, (list, tuple, np.ndarray))
+        lists += [as_pole(pole) for pole in entry] if several else [as_pole(entry)]
+        paired = several and len(entry) == 2 and all(map(is_number, entry))
+        pairs += [as_pole(pole) for pole in entry] if several and not paired else [as_pole(entry)]
+    return [pairs, lists]
