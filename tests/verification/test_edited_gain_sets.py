@@ -106,6 +106,13 @@ ALLOWED: dict[str, dict[str, str]] = {
     "region-observer": {
         "options.noise.*": WEAKER,
         "options.goal": SEARCH,
+        "options.region.*": "what was asked for; every claim is of the region that the observer holds",
+        "options.sample_time": "the observer holds its own, of which every claim is",
+        "options.faults": "the observer holds its own",
+        "options.gains": "the row on gains compares the listed ones with those that run",
+        "options.*initial_state": "the errors decay from every start",
+        "observer.initial_state.*": "the errors decay from every start",
+        "observer.region.*": "a smaller region claims less",
         "options.decay": LIMIT,
         "observer.forgetting": WEAKER,
         "certificate.claims.*": WEAKER,

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
 from obsynth.analysis.existence.nonlinear_region import region_conditions
-from obsynth.errors import ObsynthError, SpecError
-from obsynth.methods.region_observer.method import RegionObserverMethod
+from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.nonlinear.region_observer import RegionObserver
-from obsynth.observers.records import named_vector
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.operating_region import OperatingRegion
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
@@ -53,12 +50,6 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield fitting_check("the observer's copy of the plant is the plant", fits=same)
     if not same:
         return
-    yield nothing_wrong(
-        "options of the region",
-        "region, sample time and faults of the options are those of the observer",
-        _other_options(design, plant, observer),
-        source="options",
-    )
     yield listed_gains(design, {"L": observer.gain})
     conditions = region_conditions(plant, observer.region, observer.faults)
     yield from condition_rows(conditions)
@@ -78,31 +69,6 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         )
         return
     yield from _proved_rows(design, terms, region, observer, drive)
-
-
-def _other_options(design: ObserverDesign, plant: DAEModel, observer: RegionObserver) -> list[str]:
-    """Return what the options say of the region and the observer does not hold."""
-    options = design.options
-    named = RegionObserverMethod(faults=options.get("faults"), **RegionObserverMethod.placeholders).fault_names(plant)
-    region = {name: tuple(map(float, ends)) for name, ends in (options.get("region") or {}).items()}
-    pairs = (
-        ("region", region == {name: tuple(ends) for name, ends in observer.region.items()}),
-        ("sample_time", options.get("sample_time") == observer.dt),
-        ("faults", named == tuple(observer.faults)),
-        ("gains", options.get("gains") is None or np.array_equal(options["gains"], observer.gain)),
-        ("initial_state", np.array_equal(_start_of(options, plant, observer), observer.initial_state)),
-    )
-    return [name for name, fits in pairs if not fits]
-
-
-def _start_of(options: Mapping[str, Any], plant: DAEModel, observer: RegionObserver) -> FloatArray:
-    """Return the initial state of the options: nominal values where they name none, NaN where they cannot be read."""
-    nominal = np.array([*plant.states.values(), *(plant.parameters[name] for name in observer.faults)])
-    names = (*plant.state_names, *observer.faults)
-    try:
-        return named_vector(options.get("initial_state"), names, nominal, "initial_state")
-    except SpecError:
-        return np.full(len(names), np.nan)
 
 
 def _slope_row(region: OperatingRegion, observer: RegionObserver) -> tuple[Check, bool]:
