@@ -66,6 +66,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "certificate.claims.gamma*": WEAKER,
     },
     "pd-observer": {
+        "options.theorem": "of the inequality that was solved; which theorem proves the gains is a claim",
         "options.delta": "the number with which the search began",
         "certificate.claims.delta": "a number of the witness",
         "certificate.claims.decay": WEAKER,

@@ -251,7 +251,6 @@ class PdObserver(Method):
     def requested_limits(cls, design: ObserverDesign) -> Limits:
         """Return what bounds its claims: rates, the disk, gains, and the range of the adaptation gain."""
         return {
-            "theorem": (("theorem", "equal"),),
             "decay": (("decay", "at least"),),
             "disk": (("disk_centre", "equal"), ("disk_radius", "at most")),
             "gain_bound": (("gain_bound", "at most"),),
