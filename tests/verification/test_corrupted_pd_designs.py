@@ -484,8 +484,13 @@ def test_units_of_states_and_faults_hide_no_corruption(name: str, share: Callabl
             )
 
 
+#: Options that bound gains, in units of faults and outputs.
+BOUNDS = ("gain_bound", "fault_rate_gain", "noise_gain")
+
+
 def in_units(design: ObserverDesign) -> ObserverDesign:
-    """The same design in other units, powers of two: exact in every digit.  Claimed bounds go, which have units."""
+    """The same design in other units, powers of two: exact in every digit.  Bounds go, asked for and
+    claimed, which have units."""
     plant, observer = design.plant, design.observer
     nx, nf = plant.nx, plant.nf
     own = np.exp2(np.round(np.linspace(-12.0, 12.0, nx + nf)))
@@ -510,4 +515,5 @@ def in_units(design: ObserverDesign) -> ObserverDesign:
         if key not in WITNESS_CLAIMS
     }
     claims = {key: v for key, v in design.certificate.claims.items() if "gain" not in key}
-    return moved.replace(gains={**top, **bottom, **more}, certificate=Certificate(matrices, claims))
+    options = {key: value for key, value in design.options.items() if key not in BOUNDS}
+    return moved.replace(gains={**top, **bottom, **more}, certificate=Certificate(matrices, claims), options=options)
