@@ -640,7 +640,7 @@ def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -
         said = RawEstimate(k, nothing, none, none, known, innovation, np.zeros((2, 1)), innovation, residuals)
         state, judged = rule.step(state, Sample(k * DT, residuals, np.zeros(1), said))
         if k == 150:
-            assert math.isnan(judged.statistic)
+            assert 0.0 <= judged.statistic < 0.1  # decided by the rows before it, which hold nothing
         if k == 151:
             assert np.linalg.norm(state.white[-1]) <= 0.5 + 1e-12
     assert np.linalg.norm(state.white[-1]) > 5.0

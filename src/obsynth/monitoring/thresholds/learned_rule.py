@@ -180,7 +180,9 @@ class LearnedRule(Rule):
             return np.zeros((1, 0))
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
-        return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
+        # Before any sample that said something of a fault the quotient is none.
+        with np.errstate(all="ignore"):
+            return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
 
     def _squares(self, observation: Any) -> FloatArray:
         """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
