@@ -11,9 +11,10 @@ import scipy.linalg
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
-from obsynth.methods.engines.region import Region, region_gain
+from obsynth.methods.engines.region import region_gain
 from obsynth.numerics.eigenstructure import jordan_form, place
 from obsynth.numerics.observable_part import observable_split
+from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import decay_rates, spectrum_error
 
 #: The paper's pair: observability indices 4 and 1.
@@ -169,9 +170,15 @@ class TestKalman:
 class TestRegion:
     @pytest.mark.one_in(4)
     @pytest.mark.parametrize(
-        "region", [Region(decay=1.0), Region(radius=6.0), Region(decay=1.5, radius=8.0), Region(1.0, 10.0, 0.8)]
+        "region",
+        [
+            NamedRegion(decay=1.0),
+            NamedRegion(radius=6.0),
+            NamedRegion(decay=1.5, radius=8.0),
+            NamedRegion(1.0, 10.0, 0.8),
+        ],
     )
-    def test_all_poles_are_inside(self, region: Region) -> None:
+    def test_all_poles_are_inside(self, region: NamedRegion) -> None:
         gain, record = region_gain(noisy(PAIR, OUTPUTS), region, solver="CLARABEL")
         poles = np.linalg.eigvals(PAIR - gain @ OUTPUTS)
         assert np.all(poles.real < -region.decay)
@@ -183,7 +190,7 @@ class TestRegion:
 
     def test_discrete(self) -> None:
         problem = noisy(np.eye(5) + 0.1 * PAIR, OUTPUTS, dt=0.1)
-        gain, _ = region_gain(problem, Region(decay=1.0), solver="CLARABEL")
+        gain, _ = region_gain(problem, NamedRegion(decay=1.0), solver="CLARABEL")
         assert np.max(np.abs(np.linalg.eigvals(problem.F - gain @ OUTPUTS))) < np.exp(-0.1)
 
     def test_large_pairs_move_only_what_lies_outside(self) -> None:
@@ -196,7 +203,7 @@ class TestRegion:
         ratios = np.sort(-before.real / np.abs(before))
         # Between the four least damped poles and the others.
         damping = float(np.mean(ratios[3:5]))
-        region = Region(decay=0.5, damping=damping)
+        region = NamedRegion(decay=0.5, damping=damping)
         assert ratios[4] > 1.01 * damping > 1.02 * ratios[3]
         gain, record = region_gain(problem, region, solver="CLARABEL")
         closed = f - gain @ problem.C
@@ -211,12 +218,12 @@ class TestRegion:
         assert np.max(rounding) < 1e-5
         assert np.all(np.min(distances, axis=0) < rounding)
         assert record["solver"] == "CLARABEL"
-        assert region_gain(problem, Region(decay=0.5), solver="CLARABEL")[1] == {}
+        assert region_gain(problem, NamedRegion(decay=0.5), solver="CLARABEL")[1] == {}
 
     def test_bad_regions(self) -> None:
         for data in ({"decay": -1.0}, {"radius": 0.0}, {"damping": 1.0}, {"decay": True}, {"side": 1.0}, {}):
             with pytest.raises(SpecError):
-                Region.of(data, 0.0)
+                NamedRegion.of(data, 0.0)
 
 
 class TestDesigns:

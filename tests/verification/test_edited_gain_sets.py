@@ -7,6 +7,7 @@ then read and verified may claim less than the file before, never more.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
@@ -21,6 +22,7 @@ from test_every_method import design_of as first_design
 import obsynth
 from obsynth.results.gain_set_writing import design_as_dict, digest_of
 from obsynth.results.gain_sets import loaded
+from obsynth.verification.requested_limits import requested_rows
 
 WORDS = "words about how the design was made, which no claim rests on"
 SEARCH = "how the search went; what it found is proved on its own"
@@ -107,13 +109,6 @@ ALLOWED: dict[str, dict[str, str]] = {
     "region-observer": {
         "options.noise.*": WEAKER,
         "options.goal": SEARCH,
-        "options.region.*": "what was asked for; every claim is of the region that the observer holds",
-        "options.sample_time": "the observer holds its own, of which every claim is",
-        "options.faults": "the observer holds its own",
-        "options.gains": "the row on gains compares the listed ones with those that run",
-        "options.*initial_state": "the errors decay from every start",
-        "observer.initial_state.*": "the errors decay from every start",
-        "observer.region.*": "a smaller region claims less",
         "options.decay": LIMIT,
         "observer.forgetting": WEAKER,
         "certificate.claims.*": WEAKER,
@@ -243,3 +238,31 @@ def test_what_the_options_ask_for_is_reached(name: str, option: str, edit: Any) 
     document = asked(name)
     assert document["design"]["options"][option] != edit
     assert not passes(document, ("options", option), edit)
+
+
+@pytest.mark.parametrize(
+    ("option", "edit"),
+    [("region", {"h2": [0.1, 0.9], "h1 - h2": [0.02, 0.55]}), ("region", "x"), ("sample_time", 1.0), ("faults", []),
+     ("initial_state", {"h1": 0.1}), ("gains", [[0.0]]), ("faults", 3)],
+)  # fmt: skip
+def test_options_of_a_region_observer_are_those_that_it_runs_with(option: str, edit: Any) -> None:
+    document = document_of("region-observer")
+    assert passes(document, ("options", option), document["design"]["options"][option])
+    assert not passes(document, ("options", option), edit)
+
+
+def test_modes_that_no_gain_moves_are_computed_only_where_a_row_fails_without_them() -> None:
+    plant = obsynth.DescriptorSystem(A=[[-3.0, 1.0], [1.0, -2.0]], C=[[1.0, 0.0]], dt=0.0)
+    design = obsynth.ui_pi_observer(plant, decay=4.0)
+    calls = list[float]()
+
+    def fixed_modes(of: obsynth.ObserverDesign) -> list[complex]:
+        calls.append(of.options["decay"])
+        return list(np.linalg.eigvals(design.observer.Az))
+
+    for rate, count in ((3.9, 0), (1e3, 1)):
+        asked = dataclasses.replace(design, options={**design.options, "decay": rate, "region": {"decay": rate}})
+        rows = list(requested_rows(asked, {}, frozenset({"decay", "region"}), fixed_modes))
+        assert [row.name for row in rows] == ["requested decay", "requested region"]
+        assert all(row.passed for row in rows)
+        assert len(calls) == count

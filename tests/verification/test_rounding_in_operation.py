@@ -64,6 +64,21 @@ def test_the_worst_of_all_roundings_comes_near_the_bound(seed: int) -> None:
         assert worst_run(observer, y, row, 13) >= 0.9 * bound[row, 0]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_sum_of_the_sizes_of_powers_is_enough_where_no_norm_is_proved_to_contract(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("obsynth.verification.rounding_in_operation.contraction_of", lambda observer: None)
+    observer, y = observer_of(seed)
+    sizes = np.abs(observer.Az)
+    observer = dataclasses.replace(observer, Az=0.9 / np.max(np.abs(np.linalg.eigvals(sizes))) * sizes)
+    bound = rounding_in_operation(observer, np.arange(observer.order), np.abs(y), np.abs(settled(observer, y)))
+    for row in range(2):
+        # No sign is used: the sum of sizes may be some times the one in the worst direction.
+        worst = worst_run(observer, y, row, 9)
+        assert worst <= bound[row, 0] <= 20.0 * worst
+
+
 def test_an_observer_without_state_rounds_its_outputs_alone() -> None:
     observer, y = observer_of(0)
     still = dataclasses.replace(observer, Cz=np.zeros_like(observer.Cz))

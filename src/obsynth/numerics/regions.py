@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, real_number, shown
+from obsynth.numerics.arguments import arguments_checked, is_finite_number, real_number, shown
 from obsynth.numerics.arrays import FloatArray, freeze
 
 
@@ -163,6 +163,73 @@ def sector(damping: float) -> LMIRegion:
     c = real_number(damping, "damping", "a ratio between 0 and 1", above=0.0, below=1.0)
     s = float(np.sqrt(1.0 - c**2))
     return LMIRegion(np.zeros((2, 2)), np.array([[s, c], [-c, s]]), f"sector({c:g})", ({"sector": c},))
+
+
+@dataclass(frozen=True)
+class NamedRegion:
+    """A region by its decay, radius and damping; ``radius`` and ``damping`` in continuous time only."""
+
+    decay: float = 0.0  # every mode decays at least as exp(-decay t), in 1/s
+    radius: float | None = None  # abs(s) <= radius, in 1/s
+    damping: float | None = None  # least ratio, 0 to 1
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any], dt: float, *, path: str = "region") -> NamedRegion:
+        """Return a checked region of poles in continuous time (``dt`` 0) or of samples of ``dt`` seconds."""
+        known = [field.name for field in fields(cls)]
+        problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
+        for key, value in data.items():
+            if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
+                problems.append(f"{key} is {value!r}: give a positive number.")
+        if not problems:
+            region = cls(**data)
+            if region.damping is not None and region.damping >= 1.0:
+                problems.append(f"damping is {region.damping}: give a ratio below 1.")
+            if region.radius is not None and region.radius <= region.decay:
+                problems.append(f"the region is empty: radius {region.radius} is not above decay {region.decay}.")
+            if dt > 0.0 and (region.radius is not None or region.damping is not None):
+                problems.append("radius and damping are for continuous time: give decay alone.")
+        if problems or not data:
+            raise SpecError(
+                "A region of poles by decay, radius and damping:",
+                path=path,
+                problems=problems or ["give at least one of decay, radius, damping."],
+            )
+        return cls(**data)
+
+    def in_time(self, unit: float) -> NamedRegion:
+        """Return the region with rates per ``unit`` (seconds) instead of per second."""
+        return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
+
+    def shrunk(self, share: float) -> NamedRegion:
+        """Return the region with each of its bounds tighter by a share."""
+        return replace(
+            self,
+            decay=(1.0 + share) * self.decay,
+            radius=None if self.radius is None else (1.0 - share) * self.radius,
+            damping=None if self.damping is None else min((1.0 + share) * self.damping, 1.0),
+        )
+
+    def holds(self, values: Any, dt: float) -> bool:
+        """Whether all ``values`` lie in the region."""
+        poles = np.asarray(values, dtype=np.complex128)
+        if dt > 0.0:
+            return bool(np.all(np.abs(poles) < np.exp(-self.decay * dt)))
+        inside = np.all(poles.real < -self.decay) if self.decay else np.all(poles.real < 0.0)
+        if self.radius is not None:
+            inside = inside and np.all(np.abs(poles) <= self.radius)
+        if self.damping is not None:
+            inside = inside and np.all(-poles.real >= self.damping * np.abs(poles))
+        return bool(inside)
+
+    def as_inequality(self, dt: float) -> LMIRegion:
+        """Return the region as a linear matrix inequality: the parts that are asked for, or that of stability."""
+        if dt > 0.0:
+            return disk(0.0, float(np.exp(-self.decay * dt)))
+        parts = [half_plane(self.decay)] if self.decay else []
+        parts += [] if self.radius is None else [disk(0.0, self.radius)]
+        parts += [] if self.damping is None else [sector(self.damping)]
+        return reduce(operator.and_, parts) if parts else half_plane(0.0)
 
 
 def checked_region(region: Any, name: str = "region") -> LMIRegion:

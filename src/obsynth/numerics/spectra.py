@@ -76,9 +76,9 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
 
 
 def mean_miss(computed: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
-    """Return `spectrum_error` of a matrix that has these eigenvalues."""
+    """Return `spectrum_error` of a matrix that has these eigenvalues; of more than are wanted, those nearest in sum."""
     values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
-    if values.size != goal.size:
+    if values.size < goal.size:
         return float("inf")
     groups = _groups(values, goal, dt)
     return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
@@ -95,7 +95,9 @@ def farthest_pole(
 
 
 def _groups(computed: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:
-    """Return, for each group of wanted poles that are the same, by how much eigenvalues miss them, relatively."""
+    """Return, for each group of wanted poles that are the same, by how much eigenvalues miss them, relatively.
+
+    There are as many eigenvalues at least."""
     from scipy.optimize import linear_sum_assignment
 
     if goal.size == 0:

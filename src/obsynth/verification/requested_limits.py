@@ -7,8 +7,8 @@ reached would be read as if it were.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import reduce
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -17,7 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.eigenstructure import as_pole
-from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
+from obsynth.numerics.regions import LMIRegion, NamedRegion, checked_region
 from obsynth.numerics.spectra import mean_miss
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
@@ -40,9 +40,6 @@ POLE_TOLERANCE = 1e-4
 #: Claims may miss what was asked for by this share: the two are compared in the units of different coordinates.
 CLAIM_TOLERANCE = 1e-6
 
-#: What a region is by name, as `obsynth.ui_pi_observer` takes it.
-_NAMED = ("decay", "radius", "damping")
-
 _SOURCE = "options, and the stored numbers"
 
 
@@ -55,7 +52,7 @@ def requested_rows(
     """Yield a row for each number that the options ask for.
 
     ``placed`` holds which of decay, region and poles are about the eigenvalues of the observer; ``fixed_modes`` returns
-    those that no gain moves.
+    those that no gain moves, and is called where a row fails without it.
     """
     options, observer = design.options, design.observer
     asked = {name: bounds for name, bounds in limits.items() if options.get(name) is not None}
@@ -66,10 +63,11 @@ def requested_rows(
         )
     if not isinstance(observer, LinearObserver) or not observer.order:
         return
+    modes = _Modes(design, observer, fixed_modes)
     decay, region, poles = (options.get(name) if name in placed else None for name in ("decay", "region", "poles"))
     rate = float(decay) if decay is not None and is_number(decay) else 0.0
     if rate > 0.0:
-        yield _decay_row(observer, rate, fixed_modes(design))
+        yield _decay_row(modes, rate)
     try:
         where = None if region is None else region_of(region, observer.dt)
         readings = [] if poles is None else _readings(poles)
@@ -77,10 +75,9 @@ def requested_rows(
         yield nothing_wrong("requested poles", "region and poles are readable", [str(error)], source=_SOURCE)
         return
     if where is not None:
-        yield _region_row(_movable(_poles(observer), fixed_modes(design)), where)
+        yield _region_row(modes, where)
     if readings:
-        values = _poles(observer)
-        missed = min(mean_miss(_nearest(values, wanted), wanted, observer.dt) for wanted in readings)
+        missed = min(mean_miss(modes.poles, wanted, observer.dt) for wanted in readings)
         yield upper_bound_check(
             "requested poles",
             "the poles of the options are among those of the observer, each within this share of its size",
@@ -90,27 +87,46 @@ def requested_rows(
         )
 
 
-def region_of(region: Any, dt: float) -> LMIRegion | None:
+@dataclass(frozen=True, eq=False)
+class _Modes:
+    """The poles of an observer, computed once and where a row asks for them."""
+
+    design: ObserverDesign
+    observer: LinearObserver
+    fixed_modes: Callable[[ObserverDesign], Sequence[complex]]
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        """All of them, with more digits than double precision gives where that is practical."""
+        enclosed = enclosed_eigenvalues(self.observer.Az)
+        if enclosed is None:
+            return poles_of(self.observer)
+        return np.array([middle_of(ball) for ball in enclosed], dtype=np.complex128)
+
+    @cached_property
+    def fixed(self) -> Sequence[complex]:
+        """Those that no gain moves, from the plant."""
+        return self.fixed_modes(self.design)
+
+    @cached_property
+    def movable(self) -> ComplexArray:
+        """The poles without those nearest to the fixed ones."""
+        left = self.poles
+        for mode in self.fixed:
+            if left.size:
+                left = np.delete(left, int(np.argmin(np.abs(left - mode))))
+        return left
+
+
+def region_of(region: Any, dt: float) -> LMIRegion:
     """Return the region of an option: by name (decay, radius, damping), by its matrices, or as `checked_region` takes
     it."""
     if isinstance(region, Mapping) and region.keys() == {"L", "M"}:
         return LMIRegion(np.array(region["L"], dtype=float), np.array(region["M"], dtype=float), "the region")
-    if not isinstance(region, Mapping) or not set(region) <= set(_NAMED):
-        return checked_region(region)
-    stated: dict[str, Any] = dict(region)
-    parts = []
-    rate, radius, damping = (_number(stated.get(name)) for name in _NAMED)
-    if rate:
-        parts.append(disk(0.0, float(np.exp(-rate * dt))) if dt > 0.0 else half_plane(rate))
-    if radius is not None:
-        parts.append(disk(0.0, radius))
-    if damping is not None:
-        parts.append(sector(damping))
-    return reduce(lambda one, other: one & other, parts) if parts else None
-
-
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)
+    if isinstance(region, Mapping) and set(region) <= {field.name for field in fields(NamedRegion)}:
+        stated = {name: value for name, value in region.items() if value is not None}
+        return NamedRegion.of(stated, dt).as_inequality(dt)
+    return checked_region(region)
 
 
 def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], ...]) -> Iterator[str]:
@@ -134,22 +150,25 @@ def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], 
             yield f"{claim} {reached:.6g}, where {name} asks for {bound} {number:.6g}"
 
 
-def _decay_row(observer: LinearObserver, rate: float, fixed: Sequence[complex]) -> Check:
+def _decay_row(modes: _Modes, rate: float) -> Check:
     """Return the row that all modes but the fixed ones decay at a rate."""
+    observer = modes.observer
     row = decay_row(observer, rate)
     claim = "every mode decays at the rate (1/s) of the option decay, or faster"
-    if row.passed or not len(fixed):
+    if row.passed or not len(modes.fixed):
         return replace(row, name="requested decay", claim=claim)
     # By the shape of the region: a mode that is fixed may be slower.
-    region = disk(0.0, float(np.exp(-rate * observer.dt))) if observer.dt > 0.0 else half_plane(rate)
-    inside = _region_row(_movable(_poles(observer), fixed), region)
-    return replace(inside, name="requested decay", claim=f"{claim}, but for the {len(fixed)} that no gain moves")
+    inside = _region_row(modes, NamedRegion(decay=rate).as_inequality(observer.dt))
+    return replace(inside, name="requested decay", claim=f"{claim}, but for the {len(modes.fixed)} that no gain moves")
 
 
-def _region_row(values: ComplexArray, region: LMIRegion) -> Check:
-    """Return the row that poles lie in a region, relative to the terms of its inequality."""
-    size = np.linalg.norm(region.L, 2) + 2.0 * np.abs(values) * np.linalg.norm(region.M, 2)
-    outside = float(np.max(-region.margins(values) / np.where(size > 0.0, size, 1.0), initial=-1.0))
+def _region_row(modes: _Modes, region: LMIRegion) -> Check:
+    """Return the row that poles lie in a region, relative to the terms of its inequality.
+
+    Where all of them do, those that no gain moves are not asked for."""
+    outside = _outside(modes.poles, region)
+    if outside > POLE_TOLERANCE:
+        outside = _outside(modes.movable, region)
     return upper_bound_check(
         "requested region",
         f"the poles that a gain moves lie in {region}: the farthest outside, relative to the terms",
@@ -159,29 +178,9 @@ def _region_row(values: ComplexArray, region: LMIRegion) -> Check:
     )
 
 
-def _poles(observer: LinearObserver) -> ComplexArray:
-    """Return the poles, with more digits than double precision gives where that is practical."""
-    enclosed = enclosed_eigenvalues(observer.Az)
-    if enclosed is None:
-        return poles_of(observer)
-    return np.array([middle_of(ball) for ball in enclosed], dtype=np.complex128)
-
-
-def _movable(values: ComplexArray, fixed: Sequence[complex]) -> ComplexArray:
-    """Return the poles without those nearest to the fixed ones."""
-    left = np.asarray(values, dtype=np.complex128)
-    for mode in fixed:
-        if left.size:
-            left = np.delete(left, int(np.argmin(np.abs(left - mode))))
-    return left
-
-
-def _nearest(values: ComplexArray, wanted: Sequence[complex]) -> ComplexArray:
-    """Return, of the poles, one for each wanted: nearest in sum."""
-    from scipy.optimize import linear_sum_assignment
-
-    chosen = linear_sum_assignment(np.abs(np.subtract.outer(values, np.asarray(wanted))))[0]
-    return np.asarray(values[chosen])
+def _outside(values: ComplexArray, region: LMIRegion) -> float:
+    size = np.linalg.norm(region.L, 2) + 2.0 * np.abs(values) * np.linalg.norm(region.M, 2)
+    return float(np.max(-region.margins(values) / np.where(size > 0.0, size, 1.0), initial=-1.0))
 
 
 def _readings(poles: Any) -> list[list[complex]]:

@@ -63,35 +63,39 @@ def rounding_in_operation(observer: LinearObserver, kept: np.ndarray, y: FloatAr
     az, by = np.abs(part.Az), np.abs(part.By)
     contraction, entries = contraction_of(part), inverse_bound(az)
     unknown = np.full((len(cz), y.shape[1]), np.inf)
-    if contraction is None:
-        return unknown
     local = rounded_up(unit * (az @ z + by @ y), 2 * count)
     added = _of_the_state(part, contraction, entries, unit, local)
     if added is None:
         return unknown
-    sums = absolute_gains(part.Az, part.Cz[rows], contraction)
-    if entries is not None:
-        sums = np.minimum(sums, rounded_up(cz @ entries, 2 * count))
+    own = [] if contraction is None else [absolute_gains(part.Az, part.Cz[rows], contraction)]
+    own += [] if entries is None else [rounded_up(cz @ entries, 2 * count)]
+    sums = np.minimum.reduce(own)
     driven = rounded_up(local + unit * (az @ added), 2 * count)
     through = rounded_up(unit * (cz @ (z + added) + dy @ y), 2 * count)
     return rounded_up(sums @ driven + through, 2 * count)
 
 
 def _of_the_state(
-    observer: LinearObserver, contraction: Contraction, entries: FloatArray | None, unit: float, local: FloatArray
+    observer: LinearObserver,
+    contraction: Contraction | None,
+    entries: FloatArray | None,
+    unit: float,
+    local: FloatArray,
 ) -> FloatArray | None:
     """Return bounds on what rounding adds to the state ``(n, m)``, which is rounded again; ``None`` without a proof.
 
-    ``entries``: ``sum_k |Az|^k``, where it is finite: of delays in a chain it is exact, and no norm contracts much."""
+    ``entries``: ``sum_k |Az|^k``, where it is finite: of delays in a chain it is exact, and no norm contracts much.
+    Either it or the contraction is enough."""
     identity = np.eye(observer.order)
 
     def bound(sums: FloatArray) -> FloatArray | None:
         again = inverse_bound(rounded_up(unit * (sums @ np.abs(observer.Az)), 2 * len(sums) + 2))
         return None if again is None else rounded_up(again @ (sums @ local), 4 * len(sums) + 4)
 
-    bounds = [bound(sums) for sums in (contraction.gain(identity, identity), entries) if sums is not None]
+    by_norm = None if contraction is None else contraction.gain(identity, identity)
+    bounds = [bound(sums) for sums in (by_norm, entries) if sums is not None]
     proved = [each for each in bounds if each is not None]
-    if not proved and observer.order <= STATES_FOR_OWN_SUMS:
+    if not proved and contraction is not None and observer.order <= STATES_FOR_OWN_SUMS:
         closely = bound(absolute_gains(observer.Az, identity, contraction))
         proved = [] if closely is None else [closely]
     return np.minimum.reduce(proved) if proved else None

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
-from obsynth.errors import SolverError, SpecError
+from obsynth.errors import SolverError
 from obsynth.methods.engines.kalman_problem import KalmanProblem
-from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
-from obsynth.numerics.spectra import eigenvalues, speeds
+from obsynth.numerics.regions import NamedRegion
+from obsynth.numerics.spectra import eigenvalues
 
 #: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
 INNER_SHARE = 1e-3
@@ -31,65 +30,7 @@ LEAST_LYAPUNOV = 1e-6
 MOST_MOVED_STATES = 20
 
 
-@dataclass(frozen=True)
-class Region:
-    """Where all movable poles must lie; ``radius`` and ``damping`` in continuous time only."""
-
-    decay: float = 0.0  # every mode decays at least as exp(-decay t)
-    radius: float | None = None  # abs(s) <= radius
-    damping: float | None = None  # least ratio, 0 to 1
-
-    @classmethod
-    def of(cls, data: Mapping[str, Any], dt: float) -> Region:
-        """Return a checked region."""
-        known = [field.name for field in fields(cls)]
-        problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
-        for key, value in data.items():
-            if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
-                problems.append(f"{key} is {value!r}: give a positive number.")
-        if not problems:
-            region = cls(**data)
-            if region.damping is not None and region.damping >= 1.0:
-                problems.append(f"damping is {region.damping}: give a ratio below 1.")
-            if region.radius is not None and region.radius <= region.decay:
-                problems.append(f"the region is empty: radius {region.radius} is not above decay {region.decay}.")
-            if dt > 0.0 and (region.radius is not None or region.damping is not None):
-                problems.append("radius and damping are for continuous time: give decay alone.")
-        if problems or not data:
-            raise SpecError(
-                "Option region of ui-pi-observer:",
-                path="method.options.region",
-                problems=problems or ["give at least one of decay, radius, damping."],
-            )
-        return cls(**data)
-
-    def in_time(self, unit: float) -> Region:
-        """Return the region with rates per ``unit`` (seconds) instead of per second."""
-        return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
-
-    def shrunk(self) -> Region:
-        """Return the region inside of which poles count as well within it."""
-        return replace(
-            self,
-            decay=(1.0 + 0.5 * INNER_SHARE) * self.decay,
-            radius=None if self.radius is None else (1.0 - 0.5 * INNER_SHARE) * self.radius,
-            damping=None if self.damping is None else min((1.0 + 0.5 * INNER_SHARE) * self.damping, 1.0),
-        )
-
-    def holds(self, values: Any, dt: float) -> bool:
-        """Whether all ``values`` lie in the region."""
-        poles = np.asarray(values, dtype=np.complex128)
-        if dt > 0.0:
-            return bool(np.all(np.abs(poles) < np.exp(-self.decay * dt)))
-        inside = np.all(poles.real < -self.decay) if self.decay else np.all(poles.real < 0.0)
-        if self.radius is not None:
-            inside = inside and np.all(speeds(poles, dt) <= self.radius)
-        if self.damping is not None:
-            inside = inside and np.all(-poles.real >= self.damping * np.abs(poles))
-        return bool(inside)
-
-
-def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+def region_gain(problem: KalmanProblem, region: NamedRegion, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region and little noise, and the solver's record.
 
     Above `MOST_MOVED_STATES` states a Kalman gain of the region's rate comes first, and the record is empty where it
@@ -121,7 +62,9 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     raise failures[attempts.index(_by_inequality)]
 
 
-def _by_moving_outer_poles(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+def _by_moving_outer_poles(
+    problem: KalmanProblem, region: NamedRegion, *, solver: str
+) -> tuple[FloatArray, dict[str, Any]]:
     """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
 
     With ``F - K C = V diag(T1, T2) V^-1``, T1 inside, a gain ``V [0; K2]`` makes ``T2 - K2 C V2`` of T2.
@@ -131,7 +74,7 @@ def _by_moving_outer_poles(problem: KalmanProblem, region: Region, *, solver: st
     gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
     if gain is None:
         raise SolverError("The Riccati equation has no usable solution: give poles=, or a slower region.")
-    inner = region.shrunk()
+    inner = region.shrunk(0.5 * INNER_SHARE)
     triangular, turn, good = schur(
         problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
     )
@@ -152,7 +95,7 @@ def _by_moving_outer_poles(problem: KalmanProblem, region: Region, *, solver: st
     return np.asarray(gain + moved @ more), record
 
 
-def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+def _by_inequality(problem: KalmanProblem, region: NamedRegion, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     n, dt = problem.F.shape[0], problem.dt
     change = _scaling(problem, region)
     inverse = np.linalg.inv(change)
@@ -184,7 +127,7 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
     return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
 
 
-def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
+def _continuous_region(region: NamedRegion, p: Any, moved: Any) -> list[Any]:
     constraints = []
     if region.decay:
         constraints.append(lmi.at_most(moved + moved.T + 2.0 * region.decay * (1.0 + INNER_SHARE) * p, 0.0))
@@ -199,7 +142,7 @@ def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
     return constraints
 
 
-def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
+def _scaling(problem: KalmanProblem, region: NamedRegion) -> FloatArray:
     """Return a state change in which the error covariance of a filter of the same rate is the identity."""
 
     gain = problem.gain(region.decay)

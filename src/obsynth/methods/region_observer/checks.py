@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.existence.nonlinear_region import region_conditions
-from obsynth.errors import ObsynthError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.nonlinear.region_observer import RegionObserver
+from obsynth.observers.records import named_vector
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.operating_region import OperatingRegion
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
@@ -50,6 +51,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield fitting_check("the observer's copy of the plant is the plant", fits=same)
     if not same:
         return
+    yield nothing_wrong(
+        "options of the region",
+        "region, sample time, faults, gains and start of the options are those of the observer",
+        [*_other_options(design, plant, observer)],
+        source="options",
+    )
     yield listed_gains(design, {"L": observer.gain})
     conditions = region_conditions(plant, observer.region, observer.faults)
     yield from condition_rows(conditions)
@@ -69,6 +76,33 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         )
         return
     yield from _proved_rows(design, terms, region, observer, drive)
+
+
+def _other_options(design: ObserverDesign, plant: DAEModel, observer: RegionObserver) -> Iterator[str]:
+    """Yield the options with which the design is printed and which are not those of the observer that runs."""
+    options = design.options
+    faults = options.get("faults")
+    named = plant.parameter_names if faults is None else [faults] if isinstance(faults, str) else faults
+    try:
+        region = {str(name): [float(end) for end in ends] for name, ends in (options.get("region") or {}).items()}
+        start = named_vector(
+            options.get("initial_state"),
+            (*plant.state_names, *observer.faults),
+            np.array([*plant.states.values(), *(plant.parameters[name] for name in observer.faults)]),
+            "initial_state",
+        )
+    except (AttributeError, SpecError, TypeError, ValueError) as error:
+        yield f"region and initial_state are not readable: {error}"
+        return
+    places = [(*plant.state_names, *observer.faults).index(name) for name in observer.terms.names]
+    pairs = {
+        "region": region == observer.region,
+        "sample_time": options.get("sample_time") == observer.dt,
+        "faults": tuple(named) == tuple(observer.faults),
+        "gains": options.get("gains") is None or np.array_equal(options["gains"], observer.gain),
+        "initial_state": np.array_equal(start[places], observer.initial_state),
+    }
+    yield from (name for name, same in pairs.items() if not same)
 
 
 def _slope_row(region: OperatingRegion, observer: RegionObserver) -> tuple[Check, bool]:

@@ -13,6 +13,7 @@ from obsynth.conditions.options import OwnConstraints, SolverName, SolverOptions
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.numerics.arguments import NonNegative, OpenUnitInterval, Positive, WrittenAs, problem_with, shown
+from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
@@ -24,7 +25,6 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.over_region import DECAY_ROW, GAIN_WITNESSES, REGION_GAIN_ROW, WITNESSES
 
 if TYPE_CHECKING:
-    from obsynth.methods.engines.region import Region
     from obsynth.verification.requested_limits import Limits
 
 
@@ -202,17 +202,16 @@ class UiPiObserver(Method):
             return None
         return {"E_sharp": self.E_sharp, "C_sharp": self.C_sharp, "G": self.G}
 
-    def checked_region(self, dt: float) -> Region | None:
+    def checked_region(self, dt: float) -> NamedRegion | None:
         """Return the region asked for."""
-        from obsynth.methods.engines.region import Region
-
         if self.region is None:
             return None
         if not isinstance(self.region, Mapping):
             raise SpecError(
                 f"region is {self.region!r}: give decay, radius, damping by name.", path=f"{OPTIONS_PATH}.region"
             )
-        return Region.of({key: value for key, value in self.region.items() if value is not None}, dt)
+        stated = {key: value for key, value in self.region.items() if value is not None}
+        return NamedRegion.of(stated, dt, path=f"{OPTIONS_PATH}.region")
 
     def checked_noise(self, output_names: Sequence[str]) -> dict[str, Any]:
         """Return the noise weights asked for, by name."""

@@ -18,7 +18,7 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
-from obsynth.methods.engines.region import Region, region_gain
+from obsynth.methods.engines.region import region_gain
 from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
@@ -29,6 +29,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
+from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
@@ -211,7 +212,7 @@ def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str)
 
 
 def _chosen(
-    method: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: Mapping[str, Any], dt: float
+    method: UiPiObserver, problem: PlacementProblem, region: NamedRegion | None, weights: Mapping[str, Any], dt: float
 ) -> Choice:
     """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
     split, time = problem.split, problem.units.time
@@ -254,7 +255,7 @@ def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, o
 
 
 def _in_region(
-    kalman: KalmanProblem, region: Region, rate: float, method: UiPiObserver
+    kalman: KalmanProblem, region: NamedRegion, rate: float, method: UiPiObserver
 ) -> tuple[FloatArray, dict[str, Any]]:
     """Return a gain for the region; without a decay, with that of the default: least noise alone hardly moves."""
     if method.region.get("decay") is None:
