@@ -78,45 +78,39 @@ class NewtonResult:
 
 
 def newton(
-    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray, sizes: FloatArray
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], start: FloatArray, sizes: FloatArray
 ) -> NewtonResult:
-    """Solve ``f(x) = 0`` from a start and sizes of the unknowns ``(n,)``."""
+    """Solve ``f(x) = 0`` from a start and sizes of the unknowns ``(n,)``; ``evaluate(x)``: the value, the scales of
+    its rows and the Newton step, ``(n,)`` each, and not finite where there are none."""
     x = start.copy()
-    value, jacobian = evaluate(x)
+    value, rows, step = evaluate(x)
     residuals = np.full(len(x), np.inf)
     for iteration in range(1, MOST_ITERATIONS + 1):
-        if not (np.isfinite(value).all() and np.isfinite(jacobian).all()):
-            defined = np.isfinite(value) & np.isfinite(jacobian).all(axis=1)
-            return NewtonResult(x, False, iteration - 1, np.where(defined, 0.0, np.inf))
-        scaled = ScaledMatrix.of(jacobian, sizes)
-        residuals = scaled.rows * value
-        try:
-            step = scaled.solve(-value)
-        except np.linalg.LinAlgError:
+        residuals = rows * value
+        if not (np.isfinite(value).all() and np.isfinite(step).all()):
             return NewtonResult(x, False, iteration - 1, residuals)
-        sizes_now = np.maximum(np.abs(x), sizes)
-        if np.abs(step / sizes_now).max() <= LAST_STEP:
+        if np.abs(step / np.maximum(np.abs(x), sizes)).max() <= LAST_STEP:
             x = x + step
-            last = scaled.rows * evaluate(x)[0]
+            last = rows * evaluate(x)[0]
             return NewtonResult(x, bool(np.abs(last).max() <= LARGEST_RESIDUAL), iteration, last)
-        damped = _damped(evaluate, x, step, scaled.rows, float(np.abs(residuals).max()))
+        damped = _damped(evaluate, x, step, rows, float(np.abs(residuals).max()))
         if damped is None:
             return NewtonResult(x, False, iteration, residuals)
-        x, value, jacobian = damped
+        x, value, rows, step = damped
     return NewtonResult(x, False, MOST_ITERATIONS, residuals)
 
 
 def _damped(
-    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
     x: FloatArray,
     step: FloatArray,
     rows: FloatArray,
     before: float,
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
     """Return the first of x + step, x + step / 2, ... at which the scaled residual is smaller, with what is there."""
     for halvings in range(MOST_HALVINGS + 1):
         tried = x + 0.5**halvings * step
-        value, jacobian = evaluate(tried)
-        if np.isfinite(value).all() and np.abs(rows * value).max() < before:
-            return tried, value, jacobian
+        found = evaluate(tried)
+        if np.isfinite(found[0]).all() and np.abs(rows * found[0]).max() < before:
+            return tried, *found
     return None

@@ -1,12 +1,13 @@
 """One implicit step of a DAE: Newton, then homotopy in the input, with sensitivities and the residual that is left.
 
 As CasADi functions the iteration is the undamped one of `obsynth.numerics.newton`; where that would damp, lead the
-input along a homotopy, or give up, the step is not to be trusted, and `ImplicitStep.solve_carefully` takes it.
+input along a homotopy, or give up, the step is not to be trusted, and `ImplicitStep.solve_carefully` takes it, with
+the same function for the Newton step.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +17,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.graph_equations import SMALL, equilibrated, solved
-from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS, NewtonResult, newton
+from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS, NewtonResult, ScaledMatrix, newton
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import Compiled, DAEFunctions
 
@@ -60,16 +61,31 @@ def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepG
     return graph
 
 
+def newton_graph(functions: DAEFunctions, dt: float) -> Any:
+    """Return the function from stages, state before, input and parameters to residual, row scales and Newton step."""
+    graphs, key = functions.model.graphs, (functions.method, dt, "newton")
+    if key not in graphs:
+        sizes = np.tile(functions.model.state_scales, functions.stages)
+        point = _point(functions)
+        value, J = functions.residual_function(*point, dt)
+        scaled, rows = equilibrated(J, sizes)
+        newton = ca.Function("newton", point, [value, rows, sizes * solved(scaled, -rows * value)])
+        graphs[key] = newton.expand() if len(sizes) <= SMALL else newton
+    return graphs[key]
+
+
+def _point(functions: DAEFunctions) -> list[Any]:
+    """Return symbols of stages, state before, input and parameters."""
+    model = functions.model
+    sizes = (("X", model.nx * functions.stages), ("x", model.nx), ("u", model.nu), ("theta", model.nq))
+    return [ca.MX.sym(name, size) for name, size in sizes]
+
+
 def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
     model, stages = functions.model, functions.stages
     n = model.nx * stages
     sizes = np.tile(model.state_scales, stages)
-    X, x = ca.MX.sym("X", n), ca.MX.sym("x", model.nx)
-    u, theta = ca.MX.sym("u", model.nu), ca.MX.sym("theta", model.nq)
-    point = [X, x, u, theta]
-    value, J = functions.residual_function(*point, dt)
-    scaled, rows = equilibrated(J, sizes)
-    newton = ca.Function("newton", point, [value, rows, sizes * solved(scaled, -rows * value)])
+    newton, point = newton_graph(functions, dt), _point(functions)
     J, start, parameters = functions.derivative_function(*point, dt)
     scaled, rows = equilibrated(J, sizes)
     right = ca.horzcat(-start, -parameters, ca.repmat(ca.DM.eye(model.nx), stages, 1))
@@ -80,7 +96,7 @@ def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph
         "sensitivities", point, [moved[last, :nx], moved[last, nx : noise.start], moved[last, noise], scaled]
     )
     if n <= SMALL:
-        newton, local = newton.expand(), local.expand()
+        local = local.expand()
     return StepGraph(newton, local, _whole(newton, sizes, stages, largest_move), n <= SMALL)
 
 
@@ -90,7 +106,7 @@ def input_effect(functions: DAEFunctions, dt: float) -> Any:
     model, stages = functions.model, functions.stages
     n = model.nx * stages
     sizes = np.tile(model.state_scales, stages)
-    point = [ca.MX.sym(name, size) for name, size in (("X", n), ("x", model.nx), ("u", model.nu), ("theta", model.nq))]
+    point = _point(functions)
     value, J = functions.residual_function(*point, dt)
     scaled, rows = equilibrated(J, sizes)
     right = -ca.densify(ca.jacobian(value, point[2]))
@@ -206,7 +222,7 @@ class ImplicitStep:
         if before is None or np.array_equal(before, u):
             if whole_step.converged:
                 return self._solution(whole_step, 1)
-            raise self._error(whole_step, k, "")
+            raise self._error(whole_step, x, u, theta, k, "")
         return self._homotopy(start, x, before, u, theta, k)
 
     def sensitivities(
@@ -221,12 +237,16 @@ class ImplicitStep:
     def _move(self, stages: FloatArray, start: FloatArray) -> float:
         return float(np.abs((stages - start) / self.sizes).max())
 
-    def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
-        dt = np.array([self.dt])
+    @cached_property
+    def _evaluated(self) -> Compiled:
+        return Compiled(newton_graph(self.functions, self.dt))
 
-        def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray]:
-            value, jacobian = self.functions.residual(stages, x, u, theta, dt)
-            return value[:, 0], jacobian
+    def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
+        """Solve from a start by the function that C has, so that both decide alike where rounding decides."""
+
+        def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            value, rows, step = self._evaluated(stages, x, u, theta)
+            return value[:, 0], rows[:, 0], step[:, 0]
 
         return newton(evaluate, start, self.sizes)
 
@@ -236,28 +256,42 @@ class ImplicitStep:
         """Lead the input from its last value to the new one, as fast as Newton follows."""
         last = self._newton(start, x, before, theta)
         if not last.converged:
-            raise self._error(last, k, " (with the input of the step before)")
+            raise self._error(last, x, before, theta, k, " (with the input of the step before)")
         reached, fraction, subsolves = 0.0, FIRST_FRACTION, 1
         while reached < 1.0:
             target = min(1.0, reached + fraction)
-            tried = self._newton(last.x, x, before + target * (u - before), theta)
+            between = before + target * (u - before)
+            tried = self._newton(last.x, x, between, theta)
             subsolves += 1
             if tried.converged and self._move(tried.x, last.x) <= self.largest_move:
                 last, reached, fraction = tried, target, 2.0 * fraction
             else:
                 fraction *= 0.5
             if fraction < LEAST_FRACTION or subsolves > MOST_SUBSOLVES:
-                raise self._error(tried, k, f" (homotopy: {100 * reached:.3g} % of the change of the input)")
+                share = f" (homotopy: {100 * reached:.3g} % of the change of the input)"
+                raise self._error(tried, x, between, theta, k, share)
         return self._solution(last, subsolves)
 
     def _solution(self, found: NewtonResult, subsolves: int) -> Solution:
         return Solution(found.x[-self.functions.model.nx :], found.x, found.residual, subsolves)
 
-    def _error(self, found: NewtonResult, k: int, where: str) -> SolverError:
+    def _error(
+        self, found: NewtonResult, x: FloatArray, u: FloatArray, theta: FloatArray, k: int, where: str
+    ) -> SolverError:
         model = self.functions.model
+        value, jacobian = self.functions.residual(found.x, x, u, theta, np.array([self.dt]))
+        is_defined = np.isfinite(value[:, 0]) & np.isfinite(jacobian).all(axis=1)
+        if not is_defined.all():
+            found = replace(found, residuals=np.where(is_defined, 0.0, np.inf))
+        elif not np.isfinite(found.residuals).all():
+            # Defined, but singular: the function of a step has no row scales there.
+            found = replace(found, residuals=ScaledMatrix.of(jacobian, self.sizes).rows * value[:, 0])
         name = model.equation_names[found.worst % model.nx]
-        defined = np.isfinite(found.residual)
-        worst = f"residual {found.residual:.3g} in sizes of the states" if defined else "which is not defined there"
+        worst = (
+            f"residual {found.residual:.3g} in sizes of the states"
+            if is_defined.all()
+            else "which is not defined there"
+        )
         return SolverError(
             f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
             f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
