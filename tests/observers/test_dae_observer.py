@@ -15,6 +15,7 @@ from obsynth import (
     DAEObserver,
     SolverError,
     SpecError,
+    VerificationError,
     dae_adaptive_observer,
     run_batch,
     simulate_dae,
@@ -415,3 +416,28 @@ def test_a_plant_that_only_a_controller_keeps_at_its_nominal_point_has_a_design(
     for name in ("NEES", "NIS"):
         (row,) = [check for check in design.report.checks if check.name == name]
         assert "runs of 40 steps" not in row.detail
+
+
+def tank_with_overflow(deviation: float) -> object:
+    """Its outflow is defined for levels from the bottom, 0 m, to the brim, 2 m."""
+    model = DAEModel(
+        {"balance": "der(h) = (1 - worn) * pump - sqrt(h) + 0.1 * sqrt(2 - h)"}, {"level": "h"}, states={"h": 1.0},
+        inputs={"pump": 0.9}, parameters={"worn": 0.0},
+    )  # fmt: skip
+    return dae_adaptive_observer(
+        model, dt=0.5, Q=1e-6, R=1e-4, form="augmented-kalman", random_walk=1e-8, initial_parameter_covariance=1e-4,
+        initial_covariance=deviation**2,
+    )  # fmt: skip
+
+
+@pytest.mark.long
+def test_starts_that_are_no_states_of_the_plant_are_drawn_again() -> None:
+    """A level that is known to 0.6 m around 1 m: one start of ten is below the bottom or above the brim."""
+    rows = {row.name: row for row in tank_with_overflow(0.6).report.checks}
+    assert "starts that have no first step were drawn again: " in rows["NEES"].detail
+
+
+def test_where_most_starts_are_no_states_it_says_so() -> None:
+    """Known to 50 m around 1 m: 98 % of the starts are below the bottom or above the brim."""
+    with pytest.raises(VerificationError, match=r"realisation fails: runs: No solution at k = 1: .*'balance'"):
+        tank_with_overflow(50.0)

@@ -86,6 +86,23 @@ def test_where_damped_newton_gives_up_the_homotopy_goes_on() -> None:
     assert (300.0 - v - c) / 10.0 == pytest.approx(1e-12 * np.expm1(v / 0.002), rel=1e-6)
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("far", [1.0, 1e3, 1e7])
+def test_the_careful_step_is_the_quick_one_bit_for_bit(method, far) -> None:
+    """Where rounding decides whether a step is solved, both decide alike, and so does C, which has this function."""
+    model = exchanger()
+    rng, step = np.random.default_rng(3), ImplicitStep(DAEFunctions(model, method), 0.37)
+    u, theta = model.nominal_input, np.array([0.9, 500.0])
+    trusted = 0
+    for _ in range(20):
+        x = model.nominal_state + far * model.state_scales * rng.standard_normal(model.nx)
+        stages, _, is_trusted = step._fast(x, u, theta)
+        if is_trusted[0, 0] == 1.0:
+            trusted += 1
+            assert (step.solve_carefully(x, u, theta).stages == stages[:, 0]).all()
+    assert trusted > 0 or far > 1e6
+
+
 def cubic() -> DAEModel:
     """z^3 - z = u: three roots for small u."""
     return DAEModel({"moves": "der(a) = -a * k", "fold": "z ** 3 - z = u"}, {"seen": "z"},

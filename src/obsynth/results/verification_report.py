@@ -77,5 +77,10 @@ class VerificationReport:
 
 
 def failed_rows(report: VerificationReport) -> str:
-    """Return the rows that fail as a text."""
-    return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
+    """Return the rows that fail as a text: numbers, or why something fails that is counted."""
+    return "; ".join(
+        f"{row.name}: {row.detail.rstrip('.')}"
+        if row.detail and row.bound == 0.0
+        else f"{row.name} ({row.value:.3g} against {row.bound:.3g})"
+        for row in report.failures
+    )
