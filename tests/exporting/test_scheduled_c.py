@@ -15,6 +15,7 @@ from tests.support.polytopic_plants import WANG_A, WANG_BD, WANG_BF, WANG_C, WAN
 import obsynth
 from obsynth import ObserverDesign, PolytopicSystem, SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.scheduled.observer import ScheduledObserver
 
 _MAIN = """
 #include <stdio.h>
@@ -98,6 +99,66 @@ def test_c_equals_the_run_on_a_log(name: str, tmp_path: Path) -> None:
     numbers = run[list(observer.row_names)].to_numpy()
     assert np.array_equal(np.isnan(numbers), np.isnan(found[:, 1:]))
     assert np.nanmax(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
+
+
+def _random_plant(seed: int) -> PolytopicSystem:
+    """Return a plant of two to four states with one or two parameters that enter linearly."""
+    rng = np.random.default_rng(seed)
+    n, names = int(rng.integers(2, 5)), ("a", "b")[: 1 + seed % 2]
+
+    def moved(matrix: FloatArray, share: float) -> list[list[str]]:
+        parts = [share * rng.standard_normal(matrix.shape) for _ in names]
+        stacked = np.stack([matrix, *parts], axis=-1).tolist()
+        terms = ["1", *names]
+        return [[" + ".join(f"{x!r} * {name}" for x, name in zip(entry, terms, strict=True)) for entry in row]
+                for row in stacked]  # fmt: skip
+
+    A = rng.standard_normal((n, n))
+    plant = {
+        "A": moved(0.7 * A / abs(np.linalg.eigvals(A)).max(), 0.03), "B": moved(rng.standard_normal((n, 1)), 0.3),
+        "C": np.eye(2, n), "Bf": np.eye(n, 1) + 0.3 * rng.standard_normal((n, 1)), "Bd": rng.standard_normal((n, 1)),
+        "dt": 1.0,
+    }  # fmt: skip
+    return PolytopicSystem(plant=plant, scheduling={name: [-1.0, 2.0] for name in names})
+
+
+def _products(rho: FloatArray) -> FloatArray:
+    return np.array([1.0, *rho, *([rho.prod()] if len(rho) > 1 else [])])
+
+
+def _affine(observer: ScheduledObserver, rows: FloatArray) -> FloatArray:
+    """Return the rows of ``M0 + a M1 (+ b M2 + a b M12)``, fitted to the corners."""
+    held, inputs = observer.scheduling, observer.inputs
+    corners = np.linalg.inv([_products(corner) for corner in held.corners])
+    parts = [np.tensordot(corners, matrix, 1) for matrix in (observer.Az, observer.Bu, observer.By)]
+    z, rho, found = np.zeros(observer.order), 0.5 * (held.low + held.high), []
+    for row in rows:
+        u, given, y = np.split(row, [inputs, inputs + len(held.names)])
+        rho = np.where(np.isnan(given), rho, np.clip(given, held.low, held.high))
+        Az, Bu, By = (np.tensordot(_products(rho), part, 1) for part in parts)
+        found.append(observer.Cz @ z + observer.Du @ u + observer.Dy @ y)
+        z = Az @ z + Bu @ u + By @ y
+    return np.array(found)
+
+
+@pytest.mark.one_in(4)
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
+@pytest.mark.parametrize("seed", range(10))
+def test_c_of_random_plants_is_affine_in_the_parameters(seed: int, tmp_path: Path) -> None:
+    plant = _random_plant(seed)
+    design = obsynth.fault_estimation_filter(plant)
+    observer, rng, samples = design.scheduled[1], np.random.default_rng(seed), 150
+    parameters = rng.uniform(-1.0, 2.0, (samples, len(plant.scheduling.names)))
+    parameters[rng.integers(0, samples, 8), 0] = [np.nan, np.nan, 2.1, -1.1, 1e9, -1e9, np.nan, 3.0]
+    parameters[0, -1] = np.nan
+    rows = np.hstack([rng.standard_normal((samples, 1)), parameters, rng.standard_normal((samples, 2))])
+    found = _in_c(_compiled(design, tmp_path), rows)
+    run, claimed = observer.record(rows[:, -2:], rows[:, :-2])
+    for numbers in (run, _affine(observer, rows)):
+        assert np.max(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
+    settled = found[observer.forgetting :, 0]
+    assert np.array_equal(settled == _STATUSES.index("ok"), claimed[observer.forgetting :])
+    assert not claimed.all()
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")

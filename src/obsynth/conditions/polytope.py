@@ -376,6 +376,8 @@ class _Forms:
 def descriptor_variables(n: int, k: int) -> tuple[Any, Any]:
     """Return ``diag(P1, 0)`` and ``[[P1, 0], [P2, P3]]``, P1 ``(k, k)`` symmetric."""
     P1 = cp.Variable((k, k), symmetric=True, name="P1")
+    if k == n:  # blocks without rows have no value
+        return P1, P1
     P2, P3 = cp.Variable((n - k, k), name="P2"), cp.Variable((n - k, n - k), name="P3")
     above = [P1, np.zeros((k, n - k))]
     return cp.bmat([above, [np.zeros((n - k, k)), np.zeros((n - k, n - k))]]), cp.bmat([above, [P2, P3]])

@@ -285,11 +285,13 @@ def _least(
         for z, b, d in zip(plain.Cz, plain.B, plain.Dz, strict=True)
     ]
     size = float(max(sizes))
-    unit = _power_of_two(size) if size > 0.0 else 1.0
+    unit, known = _power_of_two(size) if size > 0.0 else 1.0, None
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
         problem = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
         if not has_numbers(problem, solver, settings, runs):
+            if known is not None:  # what is proved above it decides, not in which units the solver ends
+                return known
             raise SolverError(
                 "No common Lyapunov matrix was found for the vertices: the solver ended with "
                 f"{runs[-1]['status']!r}. That is no proof that there is none. Give a slower decay, or "
@@ -303,6 +305,7 @@ def _least(
         level = least * unit
         if level < NEGLIGIBLE[0] * size:
             return level, unit, size
+        known = level, unit, size
         unit *= _power_of_two(least)
     return level, unit, size
 
