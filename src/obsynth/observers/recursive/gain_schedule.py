@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain
+from functools import lru_cache
+from itertools import chain, islice
+from sys import maxsize
+from threading import Lock
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,6 +20,9 @@ from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, s
 
 #: Numbers of gains that are kept for a second look, of twenty megabytes.
 MOST_KEPT_GAINS = 2**21
+
+#: Gains of the last observers are kept: one whose parameters walk at random is looked at without its walk as well.
+OBSERVERS_KEPT = 2
 
 
 class GainStep(NamedTuple):
@@ -47,6 +53,7 @@ def gain_steps(
     adaptation, model = observer.adaptation, recursion.model
     first = [step for step in (model.first(),) if step is not None]
     prepared: PreparedStep | None = None
+    untaught: dict[int, tuple[FloatArray, FloatArray]] = {}  # by rows: parameters that learn nothing from them
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         # Of data alone it is the identity, which a prepared step knows.
@@ -71,7 +78,9 @@ def gain_steps(
         diffuse = solved.diffuse
         gain, Upsilon, factor = solved.estimate[:, :rows], solved.estimate[:, rows:], solved.factor
         parity, G = solved.innovation[:, :rows], -solved.innovation[:, rows:]
-        learn, retain = np.zeros((nq, rows)), np.eye(nq)
+        if rows not in untaught:
+            untaught[rows] = np.zeros((nq, rows)), np.eye(nq)
+        learn, retain = untaught[rows]
         if adaptation is not None and nq:
             innovation_map, regressor, noise = parity, G, None
             if recursion.literal and right is not None and len(H) > ne:
@@ -91,20 +100,40 @@ def gain_steps(
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, retain, parameters.spread)
 
 
-def gains_once() -> Gains:
-    """Return `gain_steps` for several that look at the same gains, which are computed once if they are few numbers."""
-    remembered_gains: dict[RecursiveObserver, tuple[int, list[GainStep], Iterator[GainStep]]] = {}
+def shared_gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
+    """Yield the same as `gain_steps`, which all who look at the same observer share if they are few numbers.
 
-    def gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
-        if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT_GAINS:
-            yield from gain_steps(observer, steps)
-            return
-        if observer not in remembered_gains or remembered_gains[observer][0] < steps:
-            remembered_gains[observer] = steps, [], gain_steps(observer, steps)
-        _, steps_so_far, further = remembered_gains[observer]
-        for position in range(steps + int(observer.early_constraints)):
-            if position == len(steps_so_far):
-                steps_so_far.append(next(further))
-            yield steps_so_far[position]
+    They follow from the observer alone, which never changes: synthesis and verification look at the same ones."""
+    plant = observer.plant
+    if steps * (plant.nx + plant.nq) * (plant.ne + plant.ny) > MOST_KEPT_GAINS:
+        yield from gain_steps(observer, steps)
+        return
+    followed = _followed(observer)
+    known = followed.steps
+    for position in range(steps + int(observer.early_constraints)):
+        yield known[position] if position < len(known) else followed.at(position)
 
-    return gains
+
+@lru_cache(maxsize=OBSERVERS_KEPT)
+def _followed(observer: RecursiveObserver) -> _Followed:
+    return _Followed(observer)
+
+
+class _Followed:
+    """The gains of an observer as far as somebody looked at them."""
+
+    def __init__(self, observer: RecursiveObserver) -> None:
+        self.steps: list[GainStep] = []
+        self._observer, self._lock = observer, Lock()
+        self._further: Iterator[GainStep] = iter(())
+
+    def at(self, position: int) -> GainStep:
+        """Return the gains of a step, of which the one before was looked at."""
+        with self._lock:
+            if position == len(self.steps):
+                step = next(self._further, None)
+                if step is None:  # at the start, and after an error
+                    self._further = islice(gain_steps(self._observer, maxsize), position, None)
+                    step = next(self._further)
+                self.steps.append(step)
+            return self.steps[position]

@@ -184,7 +184,7 @@ class ErrorProduct:
         elif self.done > self.steps // 2:
             self.late = factor.dot(self.late)
             # Singular values of every step would be most of the work: what is far from one is made one.
-            if not 1.0 / FAR_FROM_ONE < float(np.abs(self.late).max()) < FAR_FROM_ONE:
+            if not is_near_one(self.late):
                 late_size = norm_or_bound(self.late)
                 self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
 
@@ -192,9 +192,9 @@ class ErrorProduct:
         """Take the norm for the growth, give the product another unit where it would underflow; False at an end."""
         if len(self.product) <= MANY_STATES:
             flat = self.product.ravel()
-            # The Frobenius norm is at most so many times the norm, and not below it.
-            with np.errstate(over="ignore"):
-                above = math.sqrt(flat.dot(flat))
+            # The Frobenius norm is at most so many times the norm, and not below it. Unlike `dot`, `vdot` does not warn
+            # where it overflows.
+            above = math.sqrt(np.vdot(flat, flat))
             if len(flat) * GONE < above < NEAR_GROWTH * self.growth:
                 return True
         size = norm_or_bound(self.product)
@@ -237,6 +237,14 @@ class ErrorProduct:
         if per_step >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
             return second, "over the second half"
         return per_step, "from the start"
+
+
+def is_near_one(matrix: FloatArray) -> bool:
+    """Whether the largest entry of a matrix is within `FAR_FROM_ONE`, which of few entries their squares can tell."""
+    squares = float(np.vdot(matrix, matrix))
+    if matrix.size / FAR_FROM_ONE < squares < FAR_FROM_ONE:
+        return True
+    return bool(1.0 / FAR_FROM_ONE < float(np.abs(matrix).max()) < FAR_FROM_ONE)
 
 
 def norm_or_bound(matrix: FloatArray) -> float:

@@ -24,7 +24,7 @@ from obsynth.methods.engines.recursive.horizon_proof import (
 from obsynth.methods.engines.recursive.steady_state import steady_rows
 from obsynth.numerics.arrays import remembered
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.recursive.gain_schedule import gains_once
+from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
@@ -124,7 +124,7 @@ def _dynamic_rows(
     design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver, *, same: bool
 ) -> Iterator[Check]:
     """Yield the rows on what the observer does; ``same`` says that its matrices are those that are stated."""
-    ranks, gains = horizon_ranks(observer.plant, early=observer.early_constraints), gains_once()
+    ranks, gains = horizon_ranks(observer.plant, early=observer.early_constraints), shared_gains
     facts = gain_schedule_summary(observer, gains=gains)
     yield information(
         "condition of H",

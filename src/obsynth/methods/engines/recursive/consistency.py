@@ -7,7 +7,7 @@ draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -127,15 +127,24 @@ def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
 
 def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
     """Return how large the terms are that make up the state after a step, for data of these sizes."""
-    rows, columns = step.H.shape
+    inverse, state_units = _scaled_inverse(step.H.shape, step.H.tobytes())
+    terms = (np.abs(inverse) @ sizes).T / state_units
+    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * state_units).T)
+
+
+@lru_cache(maxsize=2)
+def _scaled_inverse(shape: tuple[int, int], entries: bytes) -> tuple[FloatArray, FloatArray]:
+    """Return a pseudoinverse of ``H (rows, n)``, and the units of the states ``(n,)`` in which it was taken.
+
+    Where H stays the same it is needed once for all samples."""
+    H = np.frombuffer(entries).reshape(shape)
+    rows, columns = shape
     problem = LogBalance(rows + columns)
-    problem.add(step.H, range(rows), range(rows, rows + columns))
+    problem.add(H, range(rows), range(rows, rows + columns))
     # In the units given a part of it may be less than what a pseudoinverse takes for zero.
     units = np.exp2(np.round(problem.solve()))
     row_units, state_units = units[:rows], units[rows:]
-    inverse = state_units[:, None] * np.linalg.pinv(row_units[:, None] * step.H * state_units) * row_units
-    terms = (np.abs(inverse) @ sizes).T / state_units
-    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * state_units).T)
+    return state_units[:, None] * np.linalg.pinv(row_units[:, None] * H * state_units) * row_units, state_units
 
 
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:

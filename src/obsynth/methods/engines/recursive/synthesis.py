@@ -16,6 +16,7 @@ from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
+from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
@@ -67,7 +68,7 @@ def _of_varying(
     """Return observer, gains, claims and notes; ``missing``: covariances of noise that were not stated."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
-    facts = gain_schedule_summary(observer)
+    facts = gain_schedule_summary(observer, gains=shared_gains)
     contracts = _contracts(facts) and not facts.settles
     if missing and not own_units and not contracts and plant.ne == plant.nx and _has_steady_state(observer):
         still = DescriptorSystem(
@@ -75,7 +76,7 @@ def _of_varying(
         )
         options, own_units = {**options, **_identities(PlantUnits.of(still).rounded(), options)}, True
         observer = observer_from_options(plant, options)
-        facts = gain_schedule_summary(observer)
+        facts = gain_schedule_summary(observer, gains=shared_gains)
     _require_contraction(observer, facts, () if own_units else missing)
     claims = {
         "condition": ranks.condition,
