@@ -137,8 +137,8 @@ def independent_directions(rows: FloatArray) -> FloatArray:
 
 
 def but_rounding(sums: FloatArray, size_of_terms: FloatArray) -> FloatArray:
-    """Return sums without those that cancel down to the rounding of their terms."""
-    return np.where(np.abs(sums) > CANCELLATION_TOLERANCE * size_of_terms, sums, 0.0)
+    """Return sums without those that cancel down to the rounding of their terms; what is not a number stays that."""
+    return np.where(np.abs(sums) <= CANCELLATION_TOLERANCE * size_of_terms, 0.0, sums)
 
 
 def real_but_rounding(value: complex) -> float:

@@ -31,6 +31,13 @@ MOST_RATE_STEPS = 12
 LEAST_FACTOR = 1.2
 
 
+#: A rate that is asked for is reached by this factor at least, or rounding would decide whether it is.
+WELL_REACHED = 1.001
+
+#: Rates that are tried below the one that is asked for: the first is half of it, where integrators have poles at twice
+#: the rate; then the interval is halved.
+FIRST_SHARE, RATE_BISECTIONS = 0.5, 6
+
 #: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
 NOISE_PRICE = 10.0
 
@@ -80,6 +87,27 @@ class KalmanProblem:
             else:
                 best, change, rate = gain, moved, further
         return best if rate == decay else None
+
+    def quietest_gain(self, decay: float) -> FloatArray | None:
+        """Return the gain of the least prescribed rate whose poles all decay at ``decay`` (1/s) or faster; ``None``
+        when the equation has none.  Poles of a rate lie well beyond it, which costs noise."""
+        best, change = self.solved(decay, np.eye(self.F.shape[0]))
+        if best is None or not best.size or decay == 0.0:
+            return best
+        wanted, low, high = WELL_REACHED * decay, 0.0, decay
+        noise = self.deviations(best, change)
+        for _ in range(RATE_BISECTIONS):
+            middle = 0.5 * (low + high) if low > 0.0 else FIRST_SHARE * high
+            gain, change = self.solved(middle, np.eye(self.F.shape[0]))
+            reached = 0.0 if gain is None else float(np.min(decay_rates(eigenvalues(self.F - gain @ self.C), self.dt)))
+            if gain is None or reached < wanted:
+                low = middle
+                continue
+            less = self.deviations(gain, change)
+            if not np.all(less <= noise):
+                break
+            best, noise, high = gain, less, middle
+        return best
 
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""

@@ -90,7 +90,7 @@ def filter_model(
     inverse = np.linalg.inv(form.E) if k else np.zeros((0, 0))
     zeros = np.zeros((count, k))
     known = np.hstack([form.Bu, form.By])
-    rows = _telling_rows(np.hstack([form.C, form.G @ cw, -form.Du, form.H, form.M]))
+    rows = _telling_rows(np.hstack([form.C, form.G @ cw, form.M]), np.hstack([form.Du, form.H]))
     return FilterModel(
         A=np.block([[inverse @ form.A, inverse @ form.F @ cw], [zeros, phi]]),
         C=rows @ np.hstack([form.C, form.G @ cw]),
@@ -117,14 +117,25 @@ def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
     return [int(i) for i in np.flatnonzero(reached)]
 
 
-def _telling_rows(rows: FloatArray) -> FloatArray:
-    """Return combinations ``(q, p)`` of ``rows (p, columns)`` that say something: some are empty."""
-    if not rows.size:
-        return np.eye(len(rows))
-    sizes = np.max(np.abs(rows), axis=0)
-    basis, values, _ = np.linalg.svd(rows / np.where(sizes > 0.0, sizes, 1.0))
-    rank = rank_from(values, expected=len(rows)).rank
-    return np.eye(len(rows)) if rank == len(rows) else np.asarray(basis[:, :rank].T)
+def _telling_rows(unknowns: FloatArray, known: FloatArray) -> FloatArray:
+    """Return combinations ``(q, p)`` of equations in ``unknowns (p, states and noise)`` and signals that are ``known
+    (p, columns)``, without those in which no unknown appears: empty ones, and outputs that read nothing."""
+    p = len(unknowns)
+    if not p or not unknowns.size:
+        return np.eye(p)[:0] if p else np.eye(0)
+    scaled, signals = (part / np.maximum(np.max(np.abs(part), axis=0), SMALLEST) for part in (unknowns, known))
+    lengths = np.linalg.norm(scaled, axis=1)
+    telling = np.flatnonzero(lengths > RANK_TOLERANCE * np.linalg.norm(signals, axis=1))
+    if not len(telling):
+        return np.eye(p)[:0]
+    # At length one: an equation in which the unknowns are small says as much as any.
+    basis, values, _ = np.linalg.svd(scaled[telling] / lengths[telling, None])
+    rank = rank_from(values, expected=len(telling)).rank
+    if rank == p:
+        return np.eye(p)
+    combinations = np.zeros((rank, p))
+    combinations[:, telling] = np.eye(rank) if rank == len(telling) else basis[:, :rank].T / lengths[telling]
+    return combinations
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,8 @@ class UiPiObserver(Method):
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
         Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.
     decay : float, optional, 1/s
-        A Kalman gain all of whose movable poles decay at this rate or faster; 0 is the plain Kalman gain.
+        The Kalman gain of the least prescribed rate (Anderson, Moore 1971) with which all movable poles decay at this
+        rate or faster: a gain of the rate itself is faster, and noisier.  0 is the plain Kalman gain.
     region : mapping or LMIRegion, optional
         ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
         where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without

@@ -238,7 +238,10 @@ def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, o
     """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
 
     Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
-    gain = kalman.gain(problem.units.time * decay, persistent=True)
+    rate = problem.units.time * decay
+    gain = kalman.quietest_gain(rate)
+    if gain is None:
+        gain = kalman.gain(rate, persistent=True)
     if gain is not None:
         return gain
     order = problem.split.order

@@ -32,6 +32,7 @@ from obsynth.observers.recursive.step_model import (
     PreparedStep,
     StepMatrices,
     StepModel,
+    but_rounding_of_outputs,
     right_side,
     spreads,
     with_missing_inputs,
@@ -204,7 +205,7 @@ class Recursion:
             self._prepared = PreparedStep.of(step, self._prepared)
             solved = self._prepared.taken(state.factor, right)
         if solved is None:
-            solved, learned = self._careful(state, step, right)
+            solved, learned = self._careful(state, step, but_rounding_of_outputs(right, step, y, u))
         v, G = solved.innovation[:, 0], -solved.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
         if nq and self.settings.adaptation is not None:

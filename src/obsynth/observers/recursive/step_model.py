@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.analysis.time_varying import IntArray
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.ranks import covariance_factor, product_but_rounding
 from obsynth.numerics.square_root_estimation import (
     OUTGROWN,
     LeastSquaresStep,
@@ -60,6 +60,15 @@ def right_side(
         right[:ne, 1:] = step.A @ Upsilon + step.Phi
         right[ne:, 1:] = -step.Psi
     return right
+
+
+def but_rounding_of_outputs(right: FloatArray, step: StepMatrices, y: FloatArray, u: FloatArray) -> FloatArray:
+    """Return ``right (rows, 1 + nq)`` of `right_side` with a zero where ``y - D u`` is rounding of its two terms: a
+    sensor without noise that reads a known input alone does not contradict that input."""
+    outputs = slice(len(step.A), len(step.A) + len(y))
+    cleared = right.copy(order="F")
+    cleared[outputs, 0] = product_but_rounding(-step.D, u, y)
+    return cleared
 
 
 def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:

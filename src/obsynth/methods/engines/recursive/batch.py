@@ -7,7 +7,7 @@ import numpy as np
 from obsynth.methods.engines.recursive.consistency import data_deviations, state_terms
 from obsynth.methods.engines.recursive.horizon_proof import natural_units
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.gain_schedule_summary import looked_at
@@ -92,7 +92,9 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     unit = np.eye(zero.size)
     effect = np.array([perfect.T @ (_data(observer, *_split(sample, y, u))[:, 0] - none) for sample in unit]).T
     flat = np.concatenate([y.ravel(), u.ravel()])
-    return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
+    changed = flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0])
+    # A sensor without noise that reads nothing reads zero, not what rounding leaves of it.
+    return _split(np.where(np.abs(changed) > RANK_TOLERANCE * np.abs(flat), changed, 0.0), y, u)
 
 
 def _row_sizes(observer: RecursiveObserver, H: FloatArray, S: FloatArray) -> FloatArray:
@@ -126,7 +128,8 @@ def _data(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> FloatArr
     parts = [np.hstack([start.x[:, None], np.zeros((n, nq))])]
     for k in range(len(y) - 1):
         step = model.at(k)
-        values = np.concatenate([step.B @ u[k], y[k + 1] - step.D @ u[k + 1], step.Dn @ u[k + 1]])
+        outputs = product_but_rounding(-step.D, u[k + 1], y[k + 1])
+        values = np.concatenate([step.B @ u[k], outputs, step.Dn @ u[k + 1]])
         parts.append(np.hstack([values[:, None], np.vstack([step.Phi, -step.Psi])[:, :nq]]))
     if (first := model.first()) is not None:
         parts.append(np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]]))

@@ -1,0 +1,71 @@
+"""A sensor that reads nothing takes no design away, and a rate that is asked for costs no more noise than it must."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import obsynth
+
+A = [[0.9, 0.2], [0.0, 0.8]]
+#: By name: rows of C and D, and the noise of the sensor, of a second sensor that says nothing of the states.
+SILENT = {
+    "reads nothing": ([0.0, 0.0], 0.0, 0.0),
+    "reads an input": ([0.0, 0.0], 3.0, 0.0),
+    "reads noise": ([0.0, 0.0], 0.0, 0.2),
+}
+METHODS: dict[str, dict[str, Any]] = {
+    "descriptor-kalman": {},
+    "adaptive-observer": {},
+    "functional-filter": {},
+    "ui-pi-observer": {},
+    "optimal-filter": {"delay": 2},
+}
+
+
+def with_second_sensor(name: str) -> obsynth.DescriptorSystem:
+    row, direct, noise = SILENT[name]
+    return obsynth.DescriptorSystem(
+        A=A, B=[[1.0], [0.0]], C=[[1.0, 0.0], row], D=[[0.0], [direct]], Bf=[[0.0], [1.0]],
+        Dw=np.diag([0.1, noise]), dt=0.1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", SILENT)
+def test_a_sensor_that_says_nothing_of_the_states_takes_no_design_away(name: str, method: str) -> None:
+    assert obsynth.design(with_second_sensor(name), method, **METHODS[method]).report.passed
+
+
+def test_a_filter_runs_on_a_sensor_that_reads_an_input_to_rounding() -> None:
+    design = obsynth.descriptor_kalman(with_second_sensor("reads an input"))
+    rng = np.random.default_rng(8)
+    u = rng.standard_normal((50, 1))
+    y = np.hstack([rng.standard_normal((50, 1)), 3.0 * u * (1.0 + 2.0**-52)])
+    alone = obsynth.descriptor_kalman(
+        obsynth.DescriptorSystem(
+            A=A, B=[[1.0], [0.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]], Dw=[[0.1]], dt=0.1, noise_names=["w1"]
+        )
+    )
+    states = [one.recursive[1].run(y[:, : one.plant.ny], u).states for one in (design, alone)]
+    np.testing.assert_allclose(states[0], states[1], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_decay_is_reached_with_less_noise_than_by_a_gain_of_that_rate(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, dt = 3, 0.2 * (seed % 2)
+    a = rng.standard_normal((n, n)) - 1.5 * np.eye(n)
+    a = scipy.linalg.expm(dt * a) if dt else a
+    plant = obsynth.DescriptorSystem(
+        A=a.round(3), C=rng.standard_normal((2, n)).round(3), Bf=rng.standard_normal((n, 1)).round(3),
+        Dw=0.1 * np.eye(2), dt=dt,
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant, decay=1.0)
+    plain = obsynth.ui_pi_observer(plant, decay=0.0)
+    assert 1.0 <= design.certificate.claims["decay"] < 1.3 * max(1.0, plain.certificate.claims["decay"])
+    faster = obsynth.ui_pi_observer(plant, decay=2.0)
+    assert design.certificate.claims["noise_amplification"] < 0.9 * faster.certificate.claims["noise_amplification"]
