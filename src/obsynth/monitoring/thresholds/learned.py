@@ -24,7 +24,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
     rows_needed,
 )
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
-from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.results.certificate_files import opened, sealed
@@ -108,6 +108,8 @@ class LearnedThresholds:
         How many logs these rows are from.
     healthy_time : HealthyTime
         The share of healthy rows in alarm, with its interval, on rows that were not learned from.
+    sensor_drift : float
+        Deviations of its noise by which each sensor may drift slowly without an alarm; zero: none is allowed for.
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
@@ -136,6 +138,7 @@ class LearnedThresholds:
     logs: int = 1
     healthy_time: HealthyTime = NO_HEALTHY_TIME
     repeats: FloatArray | None = None
+    sensor_drift: float = 0.0
 
     @property
     def holds(self) -> bool:
@@ -168,6 +171,11 @@ class LearnedThresholds:
             f"interval {100 * time.low:.2g} to {100 * time.high:.2g} %, "
             + (f"between {self.logs} logs)" if self.logs > 1 else "between parts of one log)")
         )
+        if self.sensor_drift:
+            text += (
+                f"; a slow drift of each sensor by {_counted_number(self.sensor_drift, 'deviation')} of its noise is "
+                "allowed for"
+            )
         if self.lasting:
             text += (
                 f"; the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
@@ -236,6 +244,7 @@ class LearnedThresholds:
             "logs": self.logs,
             "healthy_time": list(self.healthy_time),
             "repeats": self.repeats,
+            "sensor_drift": self.sensor_drift,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -263,6 +272,10 @@ def _duration(seconds: float) -> str:
 
 def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _counted_number(count: float, noun: str) -> str:
+    return f"one {noun}" if count == 1.0 else f"{count:.6g} {noun}s"
 
 
 @arguments_checked
@@ -366,4 +379,5 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         int(data["logs"]),
         HealthyTime(*map(float, data["healthy_time"])),
         None if data.get("repeats") is None else read_only(np.asarray(data["repeats"], dtype=np.float64)),
+        real_number(data.get("sensor_drift", 0.0), "sensor_drift", "deviations, 0 or more", least=0.0),
     )

@@ -26,12 +26,14 @@ from obsynth.monitoring.thresholds.learned_levels import (
     is_conformal,
     lasting_sizes,
     learned_levels,
+    offset_size,
     rows_needed,
 )
 from obsynth.monitoring.thresholds.learned_statistics import Statistics
 from obsynth.monitoring.thresholds.parameter_scores import (
     Scores,
 )
+from obsynth.monitoring.thresholds.sensor_drifts import SensorDrifts, with_room_for_drifts
 from obsynth.monitoring.thresholds.watched_columns import settling_rows, watched_names
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
@@ -75,6 +77,8 @@ def thresholds_from_rows(
     initial_covariance: FloatArray | None = None,
     repeats: FloatArray | None = None,
     validated: bool = True,
+    drifts: SensorDrifts | None = None,
+    sensor_drift: float = 0.0,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
@@ -82,7 +86,8 @@ def thresholds_from_rows(
     instead; ``like``: thresholds of which columns and directions are taken; ``logs``: which rows are of one log each;
     ``initial_covariance``: that of the states at a start anywhere; ``repeats``: from which equal sample on outputs
     count as not measured; ``validated``: whether the levels are those that
-    rows keep which are not learned from.
+    rows keep which are not learned from; ``drifts``: what drifts of the sensors do that are allowed for, of so many
+    deviations, ``sensor_drift``.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
@@ -116,6 +121,9 @@ def thresholds_from_rows(
         lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
         rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
         statistics, levels, extrapolated = learned_levels(x, every_other * rarer, statistics, seed, scores, logs)
+    if drifts is not None:
+        size = offset_size(statistics, x, logs)
+        statistics, levels = with_room_for_drifts(statistics, levels, drifts, chosen, size)
     held, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
     time = healthy_time(levels, held, every_other, room)
     judged = held if validated else not_held_out(x, statistics, scores)
@@ -143,6 +151,7 @@ def thresholds_from_rows(
         logs=max(len(logs), 1),
         healthy_time=time,
         repeats=None if repeats is None else read_only(repeats),
+        sensor_drift=0.0 if drifts is None else sensor_drift,
     )
 
 

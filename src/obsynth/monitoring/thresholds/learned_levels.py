@@ -418,12 +418,17 @@ def with_room_for_offsets(
     levels: FloatArray, statistics: Statistics, x: FloatArray, logs: Sequence[slice]
 ) -> FloatArray:
     """Return levels of T2 and MEWMA raised by what offsets add to them."""
-    e = statistics.model.whitened(x)
-    complete = np.asarray(np.isfinite(e).all(axis=1))
-    logs = logs or (slice(None),)
-    white = np.where(complete[:, None], np.nan_to_num(e), 0.0)
-    size = float(np.linalg.norm([offset_bound(column, complete.astype(np.float64), logs) for column in white.T]))
+    size = offset_size(statistics, x, logs)
     gains = np.sqrt([1.0, *((2.0 - share) / share for share in FORGETTING)])
     raised = levels.copy()
     raised[: len(gains)] = (np.sqrt(raised[: len(gains)]) + gains * size) ** 2
     return read_only(raised)
+
+
+def offset_size(statistics: Statistics, x: FloatArray, logs: Sequence[slice]) -> float:
+    """Return how long offsets of the whitened rows are that the logs, of rows ``(n, m)``, do not exclude."""
+    e = statistics.model.whitened(x)
+    complete = np.asarray(np.isfinite(e).all(axis=1))
+    logs = logs or (slice(None),)
+    white = np.where(complete[:, None], np.nan_to_num(e), 0.0)
+    return float(np.linalg.norm([offset_bound(column, complete.astype(np.float64), logs) for column in white.T]))

@@ -34,6 +34,13 @@ from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows, notes_of_sizes, notes_of_starts
 from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
+from obsynth.monitoring.thresholds.sensor_drifts import (
+    DRIFT_ROWS,
+    SensorDrifts,
+    drifts_by_runs,
+    linear_drifts,
+    sensor_deviations,
+)
 from obsynth.monitoring.thresholds.watched_columns import (
     has_innovations_by_sensor,
     settling_rows,
@@ -41,8 +48,9 @@ from obsynth.monitoring.thresholds.watched_columns import (
     watched_values,
 )
 from obsynth.monitoring.thresholds.wrong_pairs import LEAST_WRONG, NEARER, Pair, believed_pairs, taken_back, without
-from obsynth.numerics.arguments import Seed, arguments_checked
+from obsynth.numerics.arguments import NonNegative, Seed, arguments_checked
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.outliers import checked_limit
 from obsynth.observers.running import changed
 from obsynth.results.design import ObserverDesign
@@ -57,6 +65,9 @@ CHANCE = 0.01
 
 #: One false alarm in so many rows, where nothing else is asked for.
 FALSE_ALARM_RATE = "1 per 1000 rows"
+
+#: Deviations of its noise by which each sensor may drift, where nothing else is asked for.
+SENSOR_DRIFT = 0.0
 
 
 @arguments_checked
@@ -75,6 +86,7 @@ def learn_thresholds(
     warm_up: float | None = None,
     seed: Seed = 0,
     units_as_is: bool = False,
+    sensor_drift: NonNegative = SENSOR_DRIFT,
 ) -> LearnedThresholds:
     """Learn the thresholds of a design from rows of its plant without faults.
 
@@ -104,6 +116,9 @@ def learn_thresholds(
     units_as_is : bool, optional
         As for `obsynth.run_on_data`: by default a log in which one signal is likely in another unit than the plant's is
         refused, as its levels would be those of the wrong unit.
+    sensor_drift : float, optional
+        Deviations of its noise by which each sensor may drift slowly without an alarm, whether the logs show that or
+        not; 0: none.  The noise is the one that the design states, or else that of the log.
 
     Returns
     -------
@@ -174,6 +189,7 @@ def learn_thresholds(
     options: dict[str, Any] = {
         "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs,
         "logs": logs.slices_of(output.numbers), "repeats": logs.repeats,
+        "drifts": _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift), "sensor_drift": sensor_drift,
     }  # fmt: skip
     learned = thresholds_from_rows(
         design,
@@ -230,6 +246,28 @@ class _NormalLogs:
     def slices_of(self, numbers: NDArray[np.int64]) -> tuple[slice, ...]:
         """Return for each log which of some ascending row numbers are its own."""
         return tuple(slice(a, b) for a, b in _ends_of(np.searchsorted(numbers, self.borders)))
+
+
+def _drifts(
+    design: ObserverDesign, started: Callable[[], LogRun], logs: _NormalLogs, sensor_drift: float
+) -> SensorDrifts | None:
+    """Return what drifts of so many deviations of each sensor do to the rows that a design makes of normal logs; `None`
+    where none is allowed for, or nothing is known of them."""
+    if not sensor_drift:
+        return None
+    signals, ny = started().signals, len(logs.repeats)
+    offsets = sensor_drift * sensor_deviations(design, signals.deviations(logs.rows)[:, -ny:])
+    if isinstance(design.observer, LinearObserver):
+        return linear_drifts(design.observer, offsets)
+    first, last = max(logs.ends, key=lambda ends: ends[1] - ends[0])
+    log = logs.rows[first : min(last, first + DRIFT_ROWS)]
+
+    def run(added: FloatArray) -> _ObserverOutput:
+        moved = log.copy()
+        moved[:, -ny:] += added / signals.scale[-ny:]
+        return _output_of_log(design, started(), moved, first)
+
+    return drifts_by_runs(run, offsets)
 
 
 def _ends_of(borders: NDArray[np.int64]) -> list[tuple[int, int]]:

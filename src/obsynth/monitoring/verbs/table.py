@@ -242,6 +242,12 @@ VERBS = {
                         "seconds that are left out as warm-up, at the start and after gaps",
                         type=float,
                     ),
+                    option(
+                        "--sensor-drift",
+                        "N",
+                        "deviations of its noise by which each sensor may drift slowly without an alarm (0: none)",
+                        type=float,
+                    ),
                     flag("--units-as-is", "go on where a signal is likely in another unit than the plant's"),
                 )
             ),

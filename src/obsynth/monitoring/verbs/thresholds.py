@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is reported; failures are errors."""
-    from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, learn_thresholds
+    from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, SENSOR_DRIFT, learn_thresholds
 
     logs = options.data
     is_stream = logs == [STREAM]
@@ -41,6 +41,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         gap=options.gap,
         warm_up=options.warm_up,
         units_as_is=options.units_as_is,
+        sensor_drift=SENSOR_DRIFT if options.sensor_drift is None else options.sensor_drift,
     )
     file = None if target is None else learned.save(target)
     if not learned.holds:
@@ -101,5 +102,6 @@ def _payload(learned: LearnedThresholds) -> dict[str, Any]:
         "left_out": list(learned.left_out),
         "levels": dict(zip(learned.statistics.names, learned.levels.tolist(), strict=True)),
         "logs": learned.logs,
+        "sensor_drift": learned.sensor_drift,
         "healthy_time": learned.healthy_time._asdict(),
     }
