@@ -106,7 +106,8 @@ def turning_faults(plant: PolytopicSystem, *, decay: float = 1.0) -> Conditions:
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
         raise SpecError(
-            f"{name!r}: no observer of this form is shipped; obsynth.ui_pi_observer takes faults that turn.",
+            f"{name!r}: these gains are not shipped as they are; obsynth.fault_estimation_filter(plant) ships such a "
+            "correction with its proof.",
             path="plant",
         )
 

@@ -28,8 +28,12 @@ def wang_over_region(plant: PolytopicSystem, *, gamma: float | None = None, marg
     """Return (45) at every vertex in P and ``Y[1]``, ...; see `obsynth.conditions.wang2015`."""
     conditions, parts = examine_over_region(plant)
     require_all(conditions)
-    if parts is None:  # every condition holds, so there are parts
-        raise SpecError("The plant has no filter over its region.", path="plant")
+    if not isinstance(parts, FilterOverRegion):
+        raise SpecError(
+            "The faults turn with the scheduling: (45) is for faults that keep their directions. Take "
+            "obsynth.conditions.turning_faults.",
+            path="plant",
+        )
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, L0, U2 = errors_over_region(parts, W)
     inequalities = vertex_inequalities(errors, level=gamma, margin=margin)

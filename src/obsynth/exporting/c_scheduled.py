@@ -111,6 +111,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "PARAMETERS": len(held.names),
         "FUNCTIONS": max(len(held.functions), 1),
         "STATE_COUNT": nx,
+        **({} if observer.correction is None else {"RESIDUAL_COUNT": nr}),
         "ROW_COUNT": nx + nf + nr,
         "FORGETTING": observer.forgetting,
     }
@@ -119,6 +120,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "U_COUNT": nu,
         "FAULT_COUNT": nf,
         "DIVIDES": int(not observer.effectiveness_is_one),
+        "CORRECTS": int(observer.correction is not None),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }
     groups = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
@@ -171,6 +173,8 @@ def _tables(observer: ScheduledObserver) -> dict[str, FloatArray]:
         tables |= {"Du": observer.Du, "Bu": np.vstack(list(observer.Bu))}
     if not observer.effectiveness_is_one:
         tables["effectiveness"] = np.vstack(list(observer.effectiveness))
+    if observer.correction is not None:
+        tables["correction"] = np.vstack(list(observer.correction))
     if not held.gives_weights:
         tables["bounds"] = held.bounds
     return tables

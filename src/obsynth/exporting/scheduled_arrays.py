@@ -23,6 +23,7 @@ def scheduled_arrays(design: ObserverDesign) -> dict[str, Any]:
         "C": observer.Cz,
         "D": np.hstack([observer.Du, observer.Dy]),
         "effectiveness": np.moveaxis(observer.effectiveness, 0, -1),
+        **({} if observer.correction is None else {"correction": np.moveaxis(observer.correction, 0, -1)}),
         "x0": np.zeros((observer.order, 1)),
         "Ts": observer.dt,
         "parameters": list(held.names),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.turning_filter import TURNING_CONDITION
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
@@ -130,7 +131,13 @@ def design(
 
         report_stage("designing by every method that exists")
         if kind_of(own) == "polytopic":
-            return made(own, _for_region(own, options), options, advise=True)
+            *others, last = _for_region(own, options)
+            for current in others:
+                try:
+                    return made(own, current, options, advise=True)
+                except SolverError:
+                    report_stage(f"{current} found no certificate: the next method that exists is designed")
+            return made(own, last, options, advise=True)
         with failed_computations(), one_thread_if_small(own.nx):
             working = working_plant(own, recovery, report_stage, None)
             own, recovery = working.plant, working.recovery
@@ -139,15 +146,22 @@ def design(
     return made(own, method, options, advise=True)
 
 
-def _for_region(plant: Plant, options: Mapping[str, Any]) -> str:
-    """Return the first method that exists over the region of a polytopic plant with these options."""
+def _for_region(plant: Plant, options: Mapping[str, Any]) -> list[str]:
+    """Return the methods that exist over the region of a polytopic plant with these options; one that does not, else.
+
+    Several only where no certificate may be found although the first exists: for faults that turn with the scheduling.
+    """
     faulty = isinstance(plant, PolytopicSystem) and plant.nf > 0
     known = [method for method in methods_for("polytopic") if "faults" in method_class(method).purposes or not faulty]
     taking = [method for method in known if set(options) <= set(field_types(method_class(method)))]
+    existing: list[str] = []
     for method in taking:
-        if all(condition.holds for condition in method_class(method).of(options).existence(plant)):
-            return method
-    return (taking or known)[0]
+        conditions = method_class(method).of(options).existence(plant)
+        if all(condition.holds for condition in conditions):
+            existing.append(method)
+            if not any(condition.name == TURNING_CONDITION for condition in conditions):
+                break
+    return existing or [(taking or known)[0]]
 
 
 def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any]) -> None:

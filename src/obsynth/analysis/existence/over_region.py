@@ -15,16 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.effectiveness import effectiveness_condition, inverse_bound
 from obsynth.analysis.existence.restricted_equivalent import prepare, with_sensor_faults_as_states
+from obsynth.analysis.existence.turning_filter import TurningFilter, has_turning_form, turning_conditions
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import SCHEDULED_MATRICES, PolytopicSystem
-from obsynth.proofs.vertex_inequalities import prove_nonsingular
 
-#: What is kept of ``1 / |Delta^-1|`` in its proof, largest share first.
-EFFECTIVENESS_SHARES = (1.0 - 1e-9, 0.99, 0.5, 0.1)
 #: Roundings of an entry by a least-squares solution, beside the largest entry, for each row.
 LEAST_SQUARES_ROUNDINGS = 16.0
 #: Points where an entry vanishes that are looked at: each costs as much as a vertex.
@@ -63,9 +62,11 @@ def conditions_over_region(plant: PolytopicSystem, *, exactly: bool = True) -> t
     return tuple(_in_order(plant, exactly, []))
 
 
-def examine_over_region(plant: PolytopicSystem) -> tuple[tuple[Condition, ...], FilterOverRegion | None]:
+def examine_over_region(
+    plant: PolytopicSystem,
+) -> tuple[tuple[Condition, ...], FilterOverRegion | TurningFilter | None]:
     """Return the existence conditions over a region, and the constant parts of the filter where they hold."""
-    made: list[FilterOverRegion] = []
+    made: list[FilterOverRegion | TurningFilter] = []
     conditions = tuple(_in_order(plant, True, made))
     return conditions, made[0] if made else None
 
@@ -184,7 +185,9 @@ def _sign_changes(first: FloatArray, last: FloatArray) -> FloatArray:
     return np.where(change, first / np.where(change, first - last, 1.0), np.nan)
 
 
-def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
+def _in_order(
+    plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion | TurningFilter]
+) -> Iterator[Condition]:
     constant = constant_outputs(plant, "L(mu) C(mu)", _SOURCE)
     yield constant
     if not constant.holds:
@@ -206,22 +209,18 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         "Wang 2015, Theorem 2",
     )
     directions = _directions(plant)
+    if directions is None and has_turning_form(plant):
+        yield from turning_conditions(plant, made)
+        return
     yield _direction_condition(plant, directions)
     if directions is None:
         return
     Bf0, Delta = directions
-    reach = _inverse_bound(Delta)
-    yield Condition(
-        "effectiveness",
+    reach = inverse_bound(Delta)
+    yield effectiveness_condition(
+        reach,
         "Delta(mu) of Bf(mu) = Bf0 Delta(mu) is nonsingular on the whole region: a fault does not lose its effect",
-        reach is not None,
-        np.inf if reach is None else reach,
-        np.inf,
         _SOURCE,
-        ""
-        if reach is not None
-        else "between the vertices some fault may have no effect: give a smaller region, in which it keeps one",
-        of_the_method=True,
     )
     if reach is None:
         return
@@ -277,24 +276,11 @@ def _direction_condition(plant: PolytopicSystem, directions: object) -> Conditio
         _SOURCE,
         ""
         if directions is not None
-        else "a fault turns with the scheduling, and no filter with exact decoupling for that is shipped (for two "
-        "vertices: obsynth.conditions.turning_faults). Take ui-pi-observer, for which faults may turn",
+        else "a fault turns with the scheduling, and exact decoupling of such a fault is for two vertices without Df "
+        "and Dd. Take ui-pi-observer, for which faults may turn",
         signals=() if directions is not None else plant.fault_names,
         of_the_method=True,
     )
-
-
-def _inverse_bound(Delta: tuple[FloatArray, ...]) -> float | None:
-    """Return a proved bound on ``|Delta^-1|`` over the hull; ``None`` without a proof."""
-    count = len(Delta[0])
-    if not count or all(np.array_equal(matrix, np.eye(count)) for matrix in Delta):
-        return 1.0
-    least = min(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0]) for matrix in Delta)
-    for share in EFFECTIVENESS_SHARES:
-        room = share * least
-        if room > 0.0 and prove_nonsingular(Delta, np.eye(count), room).proved:
-            return float(np.nextafter(1.0 / room, np.inf))
-    return None
 
 
 def _constant_parts(

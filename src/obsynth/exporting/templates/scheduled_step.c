@@ -180,6 +180,17 @@ int PREFIX_step(STEP_ARGUMENTS)
 #if U_COUNT
     fixed(&Du[0][0], ROW_COUNT, U_COUNT, s->u, rows);
 #endif
+#if CORRECTS
+    {
+        /* z was formed with the weights of the sample before; the states are those of the corrected z. */
+        REAL moved[LENGTH(Z_COUNT)] = {0};
+        scheduled(&correction[0][0], Z_COUNT, RESIDUAL_COUNT, s->weights, rows + STATE_COUNT + FAULT_COUNT, moved);
+        fixed(&Cz[0][0], STATE_COUNT, Z_COUNT, moved, rows);
+        for (i = 0; i < Z_COUNT; i++) {
+            s->z[i] += moved[i];
+        }
+    }
+#endif
 #if DIVIDES
     divided(s->weights, rows + STATE_COUNT);
 #endif

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.existence.over_region import EFFECTIVENESS_SHARES, conditions_over_region
+from obsynth.analysis.existence.over_region import conditions_over_region
 from obsynth.errors import PreconditionError
+from obsynth.methods.fault_estimation_filter.identities_over_region import IDENTITIES, effectiveness_row
+from obsynth.methods.fault_estimation_filter.turning_checks import turning_checks
 from obsynth.methods.fault_estimation_filter.whole_transfer import fault_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares
@@ -16,8 +18,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.proofs.vertex_inequalities import VertexProof, pairs_of, prove_nonsingular
-from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
+from obsynth.proofs.vertex_inequalities import pairs_of
+from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.error_system import ErrorModel
@@ -37,16 +39,6 @@ from obsynth.verification.over_region import (
 )
 from obsynth.verification.plant import condition_rows
 
-_IDENTITIES = {
-    "dynamics": ("unbiased: dynamics", "Az T E + By C = T A", "Wang 2015, eqs. (7), (26)"),
-    "inputs": ("unbiased: inputs", "Bu + By D = T B", "Wang 2015, eq. (23)"),
-    "state estimate": ("unbiased: state", "the state estimate equals the state when the error is zero", "(7)"),
-    "fault estimate": ("unbiased: fault", "the state has no effect on the fault estimate", "Wang 2015, eq. (25)"),
-    "residual": ("unbiased: residual", "the state has no effect on the residual", "Wang 2015, eq. (25)"),
-    "input feedthrough": ("unbiased: feedthrough", "the input has no direct effect on any estimate", "our extension"),
-}
-#: The row that says what an effectiveness that changes does to the gain.
-EFFECTIVENESS_ROW = "effectiveness of the faults"
 #: What a product of three numbers and a quotient may be rounded by.
 _ROOM = 4.0 * float(np.finfo(np.float64).eps)
 
@@ -59,6 +51,9 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
         yield fitting_check("a scheduled observer for a polytopic plant", fits=fitting)
         return
     yield from condition_rows(conditions_over_region(plant))
+    if observer.correction is not None:
+        yield from turning_checks(design, plant, observer)
+        return
     tracking = design.certificate.matrices.get("tracking")
     fits = tracking is not None and _fits(plant, observer, tracking)
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
@@ -70,7 +65,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
         return
     observers = [observer.at_vertex(place) for place in range(plant.count)]
     models = [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, observers, strict=True)]
-    yield from tracking_rows(models, plant.scheduling, _IDENTITIES)
+    yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, observers, tracking, models)
     yield from _proved_rows(design, plant, observer, tracking)
 
@@ -133,7 +128,7 @@ def _proved_rows(
     vertices = fault_error_vertices(plant.vertices, undivided, tracking)
     reach = 1.0
     if not observer.effectiveness_is_one:
-        row, reach = _effectiveness(plant, observer)
+        row, reach = effectiveness_row(plant, observer)
         yield row
     if plant.nd:
         gamma = claimed(claims, "gamma")
@@ -152,28 +147,3 @@ def _proved_rows(
     decay = claimed(claims, "region_decay")
     yield decay_row(vertices, witness, decay, discrete=True, words=words)
     yield forgetting_row(decay, observer.forgetting, discrete=True)
-
-
-def _effectiveness(plant: PolytopicSystem, observer: ScheduledObserver) -> tuple[Check, float]:
-    """Return the row that the effectiveness is nonsingular over the region, and a bound on its inverse."""
-    each = list(observer.effectiveness)
-    least = min(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0]) for matrix in each)
-    room, proof = 0.0, VertexProof(False, -np.inf, 0, "it is singular at a vertex, or next to it")
-    for share in EFFECTIVENESS_SHARES:
-        room = share * least
-        if room <= 0.0:
-            break
-        proof = prove_nonsingular(each, np.eye(plant.nf), room)
-        if proof.proved:
-            break
-    reach = float(np.nextafter(1.0 / room, np.inf)) if proof.proved else np.inf
-    row = upper_bound_check(
-        EFFECTIVENESS_ROW,
-        "the effect of the faults does not vanish over the region: the norm of its inverse is at most this",
-        reach,
-        reach if proof.proved else -np.inf,
-        source="Delta + Delta' definite at every vertex, proved in balls",
-        kind="proved",
-        detail="" if proof.proved else f"not proved: {proof.reason}",
-    )
-    return row, reach

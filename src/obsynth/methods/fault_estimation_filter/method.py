@@ -49,7 +49,8 @@ class FaultEstimationFilter(Method):
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
         ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.  Over the region of a PolytopicSystem a scheduled filter is
         designed, with one certificate for every course of the parameters: outputs constant, faults of constant
-        directions that are seen after one sample; options gamma, gamma_margin, decay, solver and solver_options.
+        directions (or, between two vertices, turning ones) that are seen after one sample; options gamma, gamma_margin,
+        decay, solver and solver_options.
     gamma : float, optional, dimensionless
         Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one; where
         the plant states noise, not less than the gain of the Kalman filter that takes d as unit white noise.

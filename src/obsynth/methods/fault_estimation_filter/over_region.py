@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import require_all
 from obsynth.analysis.existence.detectability_indexes import FaultDetectability
 from obsynth.analysis.existence.over_region import FilterOverRegion, examine_over_region
+from obsynth.analysis.existence.turning_filter import TurningFilter
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SpecError
@@ -20,6 +21,7 @@ from obsynth.methods.engines.region_notes import certificate_note, unused_rate_n
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.fault_estimation_filter.turning_faults import synthesise_turning
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
@@ -44,6 +46,8 @@ def synthesise_over_region(
     progress("checking the existence conditions over the region")
     conditions, parts = examine_over_region(plant)
     require_all(conditions)
+    if isinstance(parts, TurningFilter):
+        return synthesise_turning(plant, method, parts, progress=progress)
     if parts is None:  # every condition holds, so there are parts
         raise SpecError("The plant has no filter over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
@@ -59,8 +63,8 @@ def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synth
     """Return the filter of gains R ``(n, ny - nf)``, one for each vertex, with a certificate that is found for them."""
     conditions, parts = examine_over_region(plant)
     require_all(conditions)
-    if parts is None:  # every condition holds, so there are parts
-        raise SpecError("The plant has no filter over its region.", path="plant")
+    if not isinstance(parts, FilterOverRegion):
+        raise SpecError("The plant has no filter of such gains over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, _, _ = errors_over_region(parts, W)
     method = FaultEstimationFilter()

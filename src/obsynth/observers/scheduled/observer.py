@@ -5,9 +5,12 @@ r"""Scheduled observers: linear ones whose matrices are means, with weights from
     [\hat x; \varphi; r] = C_z z + D_u u + D_y y, \qquad \hat f = \Delta(\mu_{k-1})^{-1} \varphi
 
 with the weights of the sample itself, but for the effectiveness :math:`\Delta` of the faults: an estimate that lags by
-a sample belongs to the parameters of the sample before.  Scheduling parameters are read after the known inputs.  A
-missing one keeps its last value, one outside its range is moved to the nearest end; from then on, until the error has
-decayed again, a row is marked: nothing is claimed there.
+a sample belongs to the parameters of the sample before.  So does a correction :math:`K(\mu_{k-1}) r` that is added to z
+before the state estimates and the step are formed, where there is one: z was formed with those weights.
+
+Scheduling parameters are read after the known inputs.  A missing one keeps its last value, one outside
+its range is moved to the nearest end; from then on, until the error has decayed again, a row is marked: nothing is
+claimed there.
 
 In continuous time (``dt = 0``) the matrices are those of z', and a row that comes h seconds after the one before is
 taken by a step of implicit Euler, with the weights at its end:
@@ -80,6 +83,9 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         The signals of ``y`` and of the rows, in order.
     state_delays, fault_delays : tuple of int
         Samples by which each estimate lags.
+    correction : FloatArray, optional
+        ``(N, nz, nr)``: what the residuals of a sample correct z by, with the weights of the sample before; in discrete
+        time.  None by default.
 
     Raises
     ------
@@ -104,6 +110,7 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     residual_names: tuple[str, ...]
     state_delays: tuple[int, ...]
     fault_delays: tuple[int, ...]
+    correction: FloatArray | None = None
 
     def __post_init__(self) -> None:
         require_kind(self.scheduling, Scheduling, "scheduling", "a Scheduling")
@@ -123,6 +130,10 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
             "Dy": (rows, ny),
             "effectiveness": (count, nf, nf),
         }
+        if self.correction is not None:
+            shapes["correction"] = (count, nz, len(self.residual_names))
+            if self.dt == 0.0:
+                raise SpecError("A correction is for discrete time: leave it out.", path="correction")
         for name, shape in shapes.items():
             matrix = np.asarray(getattr(self, name), dtype=np.float64)
             if matrix.shape != shape or not np.isfinite(matrix).all():
@@ -218,6 +229,8 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.correction is None:
+            del values["correction"]
         return {**values, "scheduling": self.scheduling.as_dict()}
 
     def init(self) -> ScheduledState:
@@ -256,14 +269,18 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
         parameters = np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
         weights = self.scheduling.weights(parameters)
-        row = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y
+        row, z = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y, state.z
+        if self.correction is not None:
+            moved = np.tensordot(state.weights, self.correction, 1) @ row[self.residual_rows]
+            row[self.state_rows] += self.Cz[self.state_rows] @ moved
+            z = z + moved
         if not self.effectiveness_is_one:
             effect = np.tensordot(state.weights, self.effectiveness, 1)
             row[self.fault_rows] = np.linalg.solve(effect, row[self.fault_rows])
         after = np.zeros(self.order)
         for weight, Az, Bu, By in zip(weights, self.Az, self.Bu, self.By, strict=True):
             if weight:
-                after += weight * (Az @ state.z + Bu @ inputs + By @ y)
+                after += weight * (Az @ z + Bu @ inputs + By @ y)
         # Before the first sample nothing moved: that comparison with NaN is false.
         slow = not bool((np.abs(measured - state.parameters) > self.steps).any())
         inside = slow and self.scheduling.is_inside(measured)
