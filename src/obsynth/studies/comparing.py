@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.methods.automatic import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
@@ -37,7 +38,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import duration
+from obsynth.results.layout import duration, number
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
@@ -46,8 +47,16 @@ from obsynth.studies.comparison import (
     Comparison,
     FaultComparison,
     comparison_statement,
+    delay_in_words,
     relative_error,
     rms,
+)
+from obsynth.studies.equal_delays import (
+    HEALTHY_TIME,
+    delay_of_scenario,
+    delay_on_log,
+    level_of_normal_rows,
+    normal_rows,
 )
 from obsynth.studies.least_thresholds import thresholds_beside_least
 
@@ -161,7 +170,8 @@ def compare(
 
     Methods are ranked by the root mean square error over the scenario, with disturbances, noise and tolerances drawn,
     as a share of the size of each fault there, so that units do not matter, among those whose estimate reaches 90 % of
-    a step within the time asked for.
+    a step within the time asked for.  On a log they are ranked by the delay of an alarm first, with the level of each
+    design such that 1 % of the normal rows of the log are in alarm.
 
     Parameters
     ----------
@@ -188,7 +198,8 @@ def compare(
     false_alarms : float, optional
         Share of fault-free runs that pass the threshold of an alarm.
     data : str, Path or DataFrame, optional
-        A log with the outputs and inputs by name, replayed through every method; columns named as faults are the truth.
+        A log with the outputs and inputs by name, replayed through every method; columns named as faults are the
+        truth, and other rows than those of faults are normal.  Faults without a column are the scenario's, added to it.
     input_delay : int, optional
         Rows of ``data`` by which inputs act later than during the step that begins with them.
     columns, scales : mapping, optional
@@ -295,7 +306,7 @@ def side_by_side(
             for entry in candidates
         ]
     )
-    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
+    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, *entry.ranked_by))
     best = next((entry for entry in compared if not entry.refused), None)
     record, truth = (faulty, faulty.truth) if logged is None else (logged, _known_truth(logged, plant.fault_names))
     reference = None if log is None else log.reference
@@ -363,7 +374,7 @@ def compared_again(
         # The errors on a log that is not given are assumed.
         for name, entry in result["methods"].items():
             for fault, stored in zip(entry["faults"], body["result"]["methods"][name]["faults"], strict=True):
-                fault |= {name: float(stored[name]) for name in ("rms", "size")}
+                fault |= {name: float(stored[name]) for name in ("rms", "size", "equal_delay") if name in stored}
             entry["relative_error"] = relative_error(entry["faults"])
     sampled = on_the_clock(plant, comparison.sample_time)
     foreign = [f"plant of {name}" for name, design in designs.items() if not _is_of(design, (plant, sampled))]
@@ -422,7 +433,8 @@ def _compared(
     names = [figures.fault for figures in entry.figures]
     beside = thresholds_beside_least(plant, impulses, names, bounds)
     estimated, quiet = estimates(observer, faulty), estimates(observer, healthy)
-    replayed = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
+    replay = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
+    replayed = None if replay is None else replay[0]
     rows = []
     for row, figures in enumerate(entry.figures):
         column = plant.fault_names.index(figures.fault)
@@ -434,7 +446,12 @@ def _compared(
             truth = log.truth[:, column]
             error = replayed[:, row] - truth
         bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
-        rows.append(FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row]))
+        of_fault = FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row])
+        if replay is not None and log is not None:
+            effects = estimated[:, :, row] - quiet[:, :, row]
+            equal = _equal_delay(log, column, (replay[0][:, row], replay[1]), effects, fault, plant.dt)
+            of_fault = replace(of_fault, equal_delay=equal)
+        rows.append(of_fault)
     drawn = estimated[0] if replayed is None else replayed
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
     least = None if entry.design is None else least_possible(entry.design, later=True)
@@ -451,6 +468,25 @@ def _compared(
         read_only(drawn),
         least,
     )
+
+
+def _equal_delay(
+    log: Record,
+    column: int,
+    replay: tuple[FloatArray, NDArray[np.bool_]],
+    effects: FloatArray,
+    fault: FloatArray,
+    dt: float,
+) -> float:
+    """Return the delay of the alarm of one fault at equal healthy time in alarm on a log, in seconds: of the log's own
+    fault where it has one, else of the scenario's ``fault (steps,)``, which moves estimates by ``effects (runs,
+    steps)``; ``replay``: estimates of the log, and in which rows a decision may be taken."""
+    values, decided = replay
+    normal = normal_rows(log.truth, decided)
+    centre, level = level_of_normal_rows(values, normal)
+    if log.truth[:, column].any():
+        return delay_on_log(np.where(decided, values, np.nan), log.times, log.truth[:, column], centre, level)
+    return delay_of_scenario(values[normal], effects, fault, dt, centre, level)
 
 
 def _sized(compared: Sequence[ComparedMethod]) -> list[ComparedMethod]:
@@ -473,6 +509,10 @@ def _reason(
     words = [f"rms error {best.relative_error:.3g} of the size of the faults"]
     if other_designs and is_finite_number(other_designs[0].relative_error):
         words[0] += f" against {other_designs[0].relative_error:.3g} by {other_designs[0].method}"
+    if best.equal_delay is not None:
+        words.insert(0, delay_in_words(best.equal_delay, HEALTHY_TIME))
+        if other_designs and other_designs[0].equal_delay is not None:
+            words[0] += f", against {number(other_designs[0].equal_delay[1])} s by {other_designs[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
         words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")

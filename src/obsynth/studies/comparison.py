@@ -31,6 +31,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
 from obsynth.results.layout import number, upper_number
+from obsynth.studies.equal_delays import HEALTHY_TIME
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +54,12 @@ ON_TOP = 20.0
 
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
+
+#: Where nothing is known of delays on a log, a method comes last.
+NO_DELAYS = (float("inf"), float("inf"))
+
+#: The column that a log adds.
+EQUAL_DELAY = "delay at equal healthy time"
 
 _HEADER = (
     "method",
@@ -97,6 +104,10 @@ _FIGURE_MEANINGS = {
         "observer uses older samples"
     ),
     "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
+    EQUAL_DELAY: (
+        "seconds from a fault to its alarm with the level that 1 % of the normal rows of the log pass; never: no more "
+        "rows of the fault are in alarm than by chance"
+    ),
     "gain / least": (
         "gain from all unknown inputs to all estimates, in times the least of any causal filter that responds to the "
         "faults as this one does; inf: some such filter has none"
@@ -142,6 +153,9 @@ class FaultComparison:
         The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples can have, linear or
         not: of a fault of any time course where the estimate is one sample of it, else of a constant one.  An observer
         uses all samples before, and its bound may be smaller.
+    equal_delay : float, seconds
+        On a log: from the fault to its alarm, with the level that 1 % of the normal rows pass; median over its begins,
+        infinite where it is not found.
     """
 
     figures: FaultFigures
@@ -153,6 +167,7 @@ class FaultComparison:
     smallest_found: float
     bound: float = float("nan")
     least: float = float("nan")
+    equal_delay: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,11 +221,39 @@ class ComparedMethod:
         """Root mean square over all faults of each one's error, as a share of its size: the same in all units."""
         return relative_error([vars(fault) for fault in self.faults])
 
+    @property
+    def equal_delay(self) -> tuple[int, float] | None:
+        """How many faults raise no alarm, and the mean delay of the others (s), at equal healthy time in alarm on a
+        log; `None` without one."""
+        return mean_delay([fault.equal_delay for fault in self.faults])
+
+    @property
+    def ranked_by(self) -> tuple[float, ...]:
+        """What methods are ranked by, the least first."""
+        return (*(self.equal_delay or NO_DELAYS), self.relative_error)
+
 
 def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
     """Return the root mean square of ``rms / size`` over faults; infinite where there are none."""
     shares = [fault["rms"] / fault["size"] if fault["rms"] else 0.0 for fault in faults]
     return rms(shares) if shares else float("inf")
+
+
+def mean_delay(delays: Sequence[float]) -> tuple[int, float] | None:
+    """Return how many delays are infinite, and the mean of the finite ones; `None` where there are none at all."""
+    known = [delay for delay in delays if not np.isnan(delay)]
+    finite = [delay for delay in known if np.isfinite(delay)]
+    if not known:
+        return None
+    return len(known) - len(finite), float(np.mean(finite)) if finite else float("inf")
+
+
+def delay_in_words(delay: tuple[int, float], healthy_time: float) -> str:
+    """Return what `ComparedMethod.equal_delay` is, in words."""
+    missing, mean = delay
+    words = "no fault raises an alarm" if np.isinf(mean) else f"alarms after {number(mean)} s"
+    words += f" with {100 * healthy_time:g} % of healthy time in alarm"
+    return f"{words} ({missing} without one)" if missing and np.isfinite(mean) else words
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +309,7 @@ class Comparison:
         rows = []
         for entry in self.methods:
             for k, fault in enumerate(entry.faults):
-                order, *figures, milliseconds = _figures(entry, fault)
+                order, *figures, milliseconds = self._figures(entry, fault)
                 texts = [_number(value) for value in figures]
                 if np.isfinite(fault.bound):
                     texts[_BOUND_COLUMN] = upper_number(fault.bound)
@@ -275,13 +318,27 @@ class Comparison:
                     texts[_SHARE_COLUMNS] = ["", ""]
                 own = (str(order), f"{milliseconds:.0f}") if k == 0 else ("", "")
                 rows.append((entry.method if k == 0 else "", fault.figures.fault, own[0], *texts, own[1]))
-        return (_HEADER, *rows)
+        return (self._header, *rows)
+
+    @property
+    def _has_delays(self) -> bool:
+        """Whether there are delays at equal healthy time: only on a log."""
+        return any(not np.isnan(fault.equal_delay) for entry in self.methods for fault in entry.faults)
+
+    @property
+    def _header(self) -> tuple[str, ...]:
+        return (*_HEADER[:-3], EQUAL_DELAY, *_HEADER[-3:]) if self._has_delays else _HEADER
+
+    def _figures(self, entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]:
+        """Return the numbers of a row, in the order of the header after method and fault."""
+        figures = _figures(entry, fault)
+        return (*figures[:-3], fault.equal_delay, *figures[-3:]) if self._has_delays else figures
 
     @property
     def _units(self) -> dict[str, str]:
         return next((dict(entry.design.plant.units) for entry in self.methods if entry.design is not None), {})
 
-    def meanings(self, columns: Sequence[str] = _HEADER) -> str:
+    def meanings(self, columns: Sequence[str] | None = None) -> str:
         """Return what columns of numbers of the table mean, in one sentence.
 
         Parameters
@@ -294,7 +351,8 @@ class Comparison:
         str
             Each header with its meaning.
         """
-        texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS]
+        shown = self._header if columns is None else columns
+        texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in shown if name in _FIGURE_MEANINGS]
         return "; ".join(texts) + f". {_OF_THE_EXACT_MODEL}"
 
     @property
@@ -319,7 +377,7 @@ class Comparison:
             "beside_the_least": list(self.beside_the_least),
             "refusals": list(self.refusals),
             "rows": [
-                dict(zip(_HEADER, (entry.method, fault.figures.fault, *_figures(entry, fault)), strict=True))
+                dict(zip(self._header, (entry.method, fault.figures.fault, *self._figures(entry, fault)), strict=True))
                 for entry in self.methods
                 for fault in entry.faults
             ],
@@ -328,13 +386,14 @@ class Comparison:
 
     def claims(self) -> dict[str, Any]:
         """Return what a certificate claims: the figures of every design on the same draws."""
+        left_out = ("figures",) if self._has_delays else ("figures", "equal_delay")
         figures = {
             entry.method: {
                 "order": entry.order,
                 "fast_enough": entry.fast_enough,
                 "relative_error": entry.relative_error,
                 "faults": [
-                    {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
+                    {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k not in left_out}}
                     for fault in entry.faults
                 ],
             }
@@ -474,7 +533,9 @@ class Comparison:
         from matplotlib.figure import Figure
 
         picture = data_url(written(self._drawn(Figure)))
-        meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
+        meanings = "".join(
+            f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items() if name in self._header
+        )
         meanings += f"<li>{escape(_OF_THE_EXACT_MODEL)}</li>"
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         head, *rows = self.rows()
@@ -497,7 +558,13 @@ def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], 
     """Return what the figures of a comparison come to; ``digests`` are those of the gain sets."""
     methods = claims["methods"]
     errors = {name: relative_error(entry["faults"]) for name, entry in methods.items()}
-    best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
+    delays = {
+        name: mean_delay([float(fault.get("equal_delay", "nan")) for fault in entry["faults"]])
+        for name, entry in methods.items()
+    }
+    best = min(methods, key=lambda name: (not methods[name]["fast_enough"], *(delays[name] or NO_DELAYS), errors[name]))
+    if delays[best] is not None:
+        return _statement_on_log(claims, digests, log, best, delays)
     other_errors = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
     fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
     where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
@@ -506,6 +573,29 @@ def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], 
     return (
         f"Of the methods that exist, {best} has the least rms error of the fault estimates, as a share of each fault's "
         f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
+    )
+
+
+def _statement_on_log(
+    claims: Mapping[str, Any],
+    digests: Mapping[str, str],
+    log: Mapping[str, Any] | None,
+    best: str,
+    delays: Mapping[str, tuple[int, float] | None],
+) -> str:
+    """Return the sentence where methods are ranked by their delays at equal healthy time in alarm on a log."""
+    methods = claims["methods"]
+    own = delays[best]
+    words = "" if own is None else delay_in_words(own, HEALTHY_TIME)
+    others = ", ".join(
+        f"{number(delay[1])} s of {name}" for name, delay in delays.items() if name != best and delay is not None
+    )
+    fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
+    where = "" if log is None else f", on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
+    gain_sets = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
+    return (
+        f"Of the methods that exist, {best} has the shortest delay: {words}{f', against {others}' if others else ''}"
+        f"{fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
     )
 
 

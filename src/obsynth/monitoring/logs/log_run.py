@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import read_json
@@ -572,9 +573,13 @@ def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:
     return own == saved
 
 
-def faults_on_rows(design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them; NaN where there is none."""
+def faults_on_rows(
+    design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them, NaN where there is none; and
+    in which rows a decision may be taken ``(rows,)``."""
     run = LogRun(design)
     first = len(run.observer.state_names)
     rows = run.estimates(times.tolist(), np.hstack([u, y]))
-    return np.array([row.values[first : first + len(run.observer.fault_names)] for row in rows])
+    faults = np.array([row.values[first : first + len(run.observer.fault_names)] for row in rows])
+    return faults, np.array([row.status in DECIDING for row in rows], dtype=bool)
