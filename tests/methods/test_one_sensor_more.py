@@ -40,6 +40,19 @@ def test_a_sensor_that_says_nothing_of_the_states_takes_no_design_away(name: str
     assert obsynth.design(with_second_sensor(name), method, **METHODS[method]).report.passed
 
 
+@pytest.mark.parametrize("name", SILENT)
+def test_a_detection_filter_has_the_same_claims_beside_a_sensor_that_says_nothing(name: str) -> None:
+    row, direct, noise = SILENT[name]
+    alone = obsynth.DescriptorSystem(A=[[-1.0, 0.2], [0.0, -2.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]], Dw=[[0.1]])
+    both = alone.replace(
+        B=[[1.0], [0.0]], C=[[1.0, 0.0], row], D=[[0.0], [direct]], Df=None, Dd=None, Dw=np.diag([0.1, noise]),
+        Bw=None, noise_names=None, output_names=None,
+    )  # fmt: skip
+    claims = [obsynth.detection_filter(plant, band=(0.0, 10.0)).certificate.claims for plant in (alone, both)]
+    assert claims[1]["fault_sensitivity"] == pytest.approx(claims[0]["fault_sensitivity"], rel=1e-6)
+    assert claims[1]["disturbance_gain"] == pytest.approx(claims[0]["disturbance_gain"], rel=1e-6)
+
+
 def test_a_filter_runs_on_a_sensor_that_reads_an_input_to_rounding() -> None:
     design = obsynth.descriptor_kalman(with_second_sensor("reads an input"))
     rng = np.random.default_rng(8)

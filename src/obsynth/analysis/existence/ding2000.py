@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.existence.condition import Condition, rank_condition
 from obsynth.analysis.existence.statements import Evaluator
@@ -71,8 +72,8 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
                 of_the_method=error.condition == "index",
             ),
         )
-    _, direct = unknown_inputs(smooth)
-    reach = decide_rank(direct, expected=smooth.ny)
+    reading = reading_outputs(smooth)
+    reach = decide_rank(unknown_inputs(smooth)[1][reading], expected=len(reading))
     remedy = (
         "Unknown inputs and noise do not reach every output directly ([Dd, Dw] lacks row rank): some residual is free "
         "of them at high frequencies. Ask functional_filter for residuals, or state the noise of all sensors."
@@ -83,6 +84,12 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
         _detectable(smooth),
         *(_no_zero_on_the_axis(plant) if reach.full else ()),
     )
+
+
+def reading_outputs(plant: DescriptorSystem) -> NDArray[np.intp]:
+    """Return the outputs in which a state, a fault, an unknown input or noise appears: others say nothing."""
+    rows = np.hstack([plant.C, plant.Df, *unknown_inputs(plant)[1:]])
+    return np.flatnonzero(rows.any(axis=1))
 
 
 def _detectable(plant: DescriptorSystem) -> Condition:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
-from obsynth.analysis.existence.ding2000 import unknown_inputs
+from obsynth.analysis.existence.ding2000 import reading_outputs, unknown_inputs
 from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.method import Synthesis
@@ -49,8 +49,14 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
     elimination = eliminate_algebraic_states(plant)
     smooth = elimination.plant if elimination.description else plant
     progress("choosing the gains")
-    units = _OwnUnits.of(smooth)
-    gain, weight = units.in_data_units(*_gains(units.scaled(smooth)))
+    reading = reading_outputs(smooth)
+    designed = smooth.replace(
+        **{name: getattr(smooth, name)[reading] for name in ("C", "D", "Dd", "Df", "Dw")},
+        output_names=[smooth.output_names[place] for place in reading],
+    )
+    units = _OwnUnits.of(designed)
+    gain, weight = np.zeros((smooth.nx, smooth.ny)), np.zeros((smooth.ny, smooth.ny))
+    gain[:, reading], weight[np.ix_(reading, reading)] = units.in_data_units(*_gains(units.scaled(designed)))
     observer = LinearObserver(
         Az=smooth.A - gain @ smooth.C,
         Bu=smooth.B - gain @ smooth.D,
