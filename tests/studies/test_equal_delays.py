@@ -56,6 +56,7 @@ def test_the_soonest_alarm_is_first_though_another_design_has_less_noise(tmp_pat
     place = header.index("delay at equal healthy time")
     assert [float(row[place]) for row in rows] == [entry.faults[0].equal_delay for entry in found.methods]
     assert "delay at equal healthy time" in found.page()
+    assert first.label == f"{first.method} ({first.equal_delay[1]:g} s)"
     certificate = found.save(tmp_path / "c.json")
     for data in (None, file):
         assert obsynth.verify_certificate(certificate, data=data).passed, data

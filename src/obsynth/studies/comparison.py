@@ -228,6 +228,14 @@ class ComparedMethod:
         return mean_delay([fault.equal_delay for fault in self.faults])
 
     @property
+    def label(self) -> str:
+        """What it is called in a picture: with its delay at equal healthy time in alarm, on a log."""
+        delay = self.equal_delay
+        if delay is None:
+            return self.method
+        return f"{self.method} ({f'{number(delay[1])} s' if np.isfinite(delay[1]) else 'no alarm'})"
+
+    @property
     def ranked_by(self) -> tuple[float, ...]:
         """What methods are ranked by, the least first."""
         return (*(self.equal_delay or NO_DELAYS), self.relative_error)
@@ -469,7 +477,7 @@ class Comparison:
                 # The best lies on top.
                 style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(drawn) - rank}
                 response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
-                left_panel.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
+                left_panel.plot(np.arange(len(response)) * self.sample_time, response, label=entry.label, **style)
                 noisy = entry in far[row]
                 label = {"label": f"{entry.method}, far noisier"} if noisy else {}
                 panels[int(noisy)].plot(self.times, estimate, **style, **label, linewidth=0.4 if noisy else 0.8)

@@ -92,7 +92,7 @@ VERBS = {
         "Design by every method that exists for a spec's plant, and compare them on its scenario.",
         (
             SYSTEM,
-            option("--data", "FILE", "a log, as for run, to replay through every method", type=Path),
+            option("--data", "FILE", "a log, as for run, that ranks methods by the delay of alarms", type=Path),
             MAP,
             SCALE,
             option("--out", "FILE", "write a page (HTML), or a certificate for obsynth verify (.json)", type=Path),
