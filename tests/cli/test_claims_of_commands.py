@@ -85,6 +85,23 @@ TABLE: dict[str, tuple[list[str], str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+def test_a_threshold_that_adapts_has_no_number_of_the_exact_model(capsys: pytest.CaptureFixture[str]) -> None:
+    """That of the exact model was printed as the one within the tolerances."""
+    command, _, _ = TABLE["evaluate, over tolerances"]
+    assert main(command) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Its threshold (it adapts to the signals of each run): never passed without a fault" in told
+    assert "at the end of a run" not in told
+
+
+def test_noise_that_a_test_has_bounds_of_is_in_no_deviations(capsys: pytest.CaptureFixture[str]) -> None:
+    """Three deviations, the bound, were called one deviation."""
+    command, _, _ = TABLE["evaluate, a guaranteed test"]
+    assert main(command) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "sensor noise within its bounds (0.0034641 rad/s at motor speed" in told
+
+
 def paragraph(text: str, claim: str) -> tuple[str, re.Match[str]]:
     """Return the paragraph, in one line, in which a claim stands, and the claim."""
     for part in re.split(r"\n\s*\n", text):

@@ -39,7 +39,8 @@ def test_json_is_what_python_gives(gains, capsys):
     assert (printed["runs"], printed["confidence"]) == (40, 0.95)
     assert printed["monitor"]["kind"] == "pointwise"
     assert "never passed without a fault" in printed["monitor"]["statement"]
-    assert printed["monitor"]["final_threshold"] == obsynth.monitor(design, scenario).threshold[-1]
+    # The constants have tolerances: the threshold adapts to the signals, and that of the exact model is not it.
+    assert printed["monitor"]["final_threshold"] is None
 
 
 def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys):

@@ -43,7 +43,8 @@ def test_the_papers_plant() -> None:
 
 def test_the_line_of_a_plant_has_both_weights_the_least_and_one_sample_more() -> None:
     assert least_possible_of(WANG) == (
-        "Least gain from the disturbances to the fault estimates with delay 1: 1.4647 with the paper's W (Wang 2015), "
+        "Least gain from the disturbances, held over each sample, to the fault estimates with delay 1, if the model is "
+        "exact: 1.4647 with the paper's W (Wang 2015), "
         "1 with a free W, 1 of any causal filter; with one sample more: 0."
     )
     assert least_possible_of(WANG.replace(Bd=WANG.Bd[:, :0], Dd=WANG.Dd[:, :0], disturbance_names=())) == ""

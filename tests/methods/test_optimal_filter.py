@@ -348,15 +348,16 @@ def test_faults_that_a_disturbance_hides_are_refused() -> None:
 def test_the_statement_has_bounds_one_more_sample_and_the_limit() -> None:
     design = obsynth.optimal_filter(ZERO_AT_2, delay=1)
     assert design.notes[0] == (
-        "Least gain over all causal filters, linear or not, with this exact fault map and delay 1: between 0.66666666 "
-        "and 0.66666668, proved; this filter: 0.66666668. With delay 2: 0.33333."
+        "Least gain from disturbances and noise together, over all causal filters, linear or not, with this exact "
+        "fault map and delay 1: between 0.66666666 and 0.66666668, proved; this filter: 0.66666668. With "
+        "delay 2: 0.33333."
     )
     assert "No delay brings it below 0.9999" in obsynth.optimal_filter(WALK).notes[0]
     zero = obsynth.optimal_filter(WANG, delay=2).notes[0]
     assert zero.endswith("and delay 2: 0; this filter: 0 but for rounding.")
     assert obsynth.optimal_filter(WANG, delay=1).notes[0].endswith("With delay 2: 0.")
     matching = obsynth.optimal_filter(HALF, **matched(ONE)).notes[0]
-    assert matching.startswith("Least gain over all causal filters, matching this reference model: between 0.447213")
+    assert "over all causal filters, matching this reference model: between 0.447213" in matching
 
 
 def test_a_gain_that_falls_with_every_sample_is_followed_and_said() -> None:

@@ -167,6 +167,11 @@ class TestKalman:
         assert closed == pytest.approx(-1.0 / 1.5, abs=1e-4)
 
 
+def test_without_an_output_no_pole_is_placed() -> None:
+    with pytest.raises(SolverError, match="no gain moves"):
+        place(np.eye(2), np.zeros((0, 2)), [-1.0, -2.0])
+
+
 class TestRegion:
     @pytest.mark.one_in(4)
     @pytest.mark.parametrize(

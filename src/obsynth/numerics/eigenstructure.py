@@ -83,6 +83,8 @@ def place(
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
         return np.zeros((0, outputs)), 1.0
+    if outputs == 0:
+        raise SolverError("No output is free of the unknown inputs: no gain moves these poles.")
     target = jordan_form(poles)
     rng = np.random.default_rng(STARTS_SEED)
     size = max(largest_singular_value(f), SMALLEST)

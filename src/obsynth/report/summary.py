@@ -315,12 +315,14 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
 
 
 def _is_of_held_disturbances(design: ObserverDesign) -> bool:
-    """Return whether gains are claimed of a sampled plant whose disturbances may move between samples."""
+    """Return whether gains or decoupling are claimed of a sampled plant whose disturbances may move between samples.
+
+    A guaranteed test says itself which disturbances it is for."""
     plant, written = design.plant, None if design.source is None else design.source.plant
     if not isinstance(plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver) or not plant.nd:
         return False
     sampled = isinstance(written, DescriptorSystem) and written.dt == 0.0 < plant.dt
-    return "gamma" in design.certificate.claims and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
+    return not is_guaranteed(design) and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:

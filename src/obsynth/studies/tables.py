@@ -75,6 +75,8 @@ def evaluation_report(
         print_section(console, f"Monitor {kind}", table)
         end = final_threshold(monitor)
         size = "" if end is None else f" ({number(end)} at the end of a run)"
+        if not isinstance(monitor, ParameterMonitor) and monitor.rule.adapts:
+            size = " (it adapts to the signals of each run)"
         console.print(Text(f"Its threshold{size}: {statement}."))
         console.print()
     for sentence in beside:
@@ -100,7 +102,9 @@ def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
 
 def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
     """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
-    if isinstance(monitor, ParameterMonitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+    if isinstance(monitor, ParameterMonitor) or monitor.rule.adapts:
+        return None
+    if not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
         return None
     return float(monitor.threshold[-1])
 

@@ -33,6 +33,8 @@ class Assumptions:
     disturbance: str = "any"
     #: Whether the plant's noise is left out, since a scenario has none.
     noise_left_out: bool = False
+    #: Whether the noise of the plant is in units of its bounds, not of its deviations.
+    noise_as_bounds: bool = False
 
     @property
     def moves(self) -> bool:
@@ -98,7 +100,7 @@ class Assumptions:
 
     def _noise(self) -> str:
         """Return the phrase on the noise: the largest value at each sensor, where each has its own."""
-        plant, times = self.plant, deviations_told(self.noise_bound)
+        plant, times = self.plant, "its bounds" if self.noise_as_bounds else deviations_told(self.noise_bound)
         sizes = self.noise_bound * np.abs(plant.Dw).sum(axis=1)
         each = [
             f"{shown(float(f'{size:.6g}'), plant.units.get(name, ''))} at {name}"

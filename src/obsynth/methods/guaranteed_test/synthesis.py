@@ -44,7 +44,7 @@ from obsynth.methods.guaranteed_test.window_observers import (
     observer_of_rows,
     rounding_of,
 )
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import Window, disturbances_in_words
 from obsynth.methods.method import Synthesis
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
@@ -354,11 +354,12 @@ def _notes(
             "No disturbance and no noise has an effect on the residual: compare it with the effect of rounding."
         )
     elif least is not None:
+        kind = disturbances_in_words(window) if isinstance(problem.plant, DescriptorSystem) else ""
         words.append(
             f"The threshold is {threshold:.4g}; the smallest possible with {question.samples} samples is {least:.4g} "
-            "(proved). "
+            f"(proved{f', for {kind}' if kind else ''}). "
             + (
-                "A fault of twice that is certain to raise an alarm."
+                f"A fault of {2.0 * threshold:.4g} is certain to raise an alarm."
                 if mean is None
                 else f"This is for the nominal plant: over the tolerances it is {mean:.4g} in the mean of the scenario."
             )

@@ -136,9 +136,9 @@ def least_possible_of(plant: DescriptorSystem) -> str:
     bounded = _driven_by_disturbances(plant)
     here, later = (_least(bounded, _map_of(delay, more=more), "hinf") for more in (0, 1))
     return (
-        f"Least gain from the disturbances to the fault estimates {_with_delay(delay)}: {paper:.5g} with the paper's W "
-        f"(Wang 2015), {free:.5g} with a free W, {_shown(here)} of any causal filter; with one sample more: "
-        f"{_shown(later)}."
+        f"Least gain from the disturbances, held over each sample, to the fault estimates {_with_delay(delay)}, if the "
+        f"model is exact: {paper:.5g} with the paper's W (Wang 2015), {free:.5g} with a free W, {_shown(here)} of any "
+        f"causal filter; with one sample more: {_shown(later)}."
     )
 
 

@@ -367,11 +367,12 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
         reached = "reached by this filter" if own == least else f"this filter: {own:.8g}"
         text = f"Least deviation {of}: {least:.8g}, {reached}."
     elif chosen.is_nothing:
-        text = f"Least gain {of}: 0; this filter: 0 but for rounding."
+        text = f"Least gain from disturbances and noise together, {of}: 0; this filter: 0 but for rounding."
     else:
         # What holds at any delay holds at this one.
         least = max(claims.get("least", 0.0), claims.get("non_causal_limit", 0.0))
         low, high = bracketed(least, claims["gain"])
+        of = f"from disturbances and noise together, {of}"
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
     places = [row.found.fault_map.delays for row in curve]
     place = places.index(fault_map.delays) if fault_map.delays in places else len(curve)

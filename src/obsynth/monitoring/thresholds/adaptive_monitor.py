@@ -270,6 +270,7 @@ def over_box(
     scenario: Scenario | None = None,
     disturbance: str = "any",
     noise_left_out: bool = False,
+    noise_as_bounds: bool = False,
 ) -> tuple[Rule, str]:
     """Return the pointwise rule over the box of the plant of a design with the noise that is bounded, and what it
     promises: for a record of a scenario, from its start unless one is given, or for data, which may have gaps."""
@@ -304,6 +305,7 @@ def over_box(
         initial_error=initial_error,
         disturbance=disturbance,
         noise_left_out=noise_left_out,
+        noise_as_bounds=noise_as_bounds,
     )
     rule = AdaptiveRule(first, later if scenario is None else first, nominal)
     return rule, adaptive_statement(first, assumed)

@@ -41,6 +41,7 @@ class AdaptiveRule(Rule):
     """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
 
     GUARANTEES = True
+    adapts = True
 
     def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule | None) -> None:
         self.plan, self._later, self.nominal = plan, later, nominal

@@ -141,7 +141,15 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
         rule, statement = over_box(
-            changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario, disturbance=_between_samples(test)
+            changed,
+            nominal,
+            bounds,
+            1.0,
+            None,
+            initial_set,
+            scenario=scenario,
+            disturbance=_between_samples(test),
+            noise_as_bounds=True,
         )
     return Monitor(
         kind,
@@ -351,7 +359,9 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
     statement = _statement(test) + ("" if own is None else "; each row has its own threshold")
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set, disturbance=_between_samples(test))
+        rule, statement = over_box(
+            changed, None, bounds, 1.0, None, initial_set, disturbance=_between_samples(test), noise_as_bounds=True
+        )
         if initial_set is None:
             statement += "; it holds once the effect of the initial error, which is not stated, has settled"
     return Monitor(

@@ -146,6 +146,8 @@ class Rule(ABC):
 
     #: Whether its threshold is never passed without a fault, which needs an error at the start that is as stated.
     GUARANTEES: ClassVar[bool] = False
+    #: Whether its threshold adapts to the signals: `table` is then only what is added to.
+    adapts: ClassVar[bool] = False
     #: Thresholds ``(any,)`` by the sample since the start, where they are known beforehand.
     table: FloatArray | None = None
     #: Columns of a run besides statistic, threshold and alarm.
