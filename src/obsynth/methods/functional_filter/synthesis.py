@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 
 from obsynth.analysis.existence.functional_filter import residual_sets
 from obsynth.analysis.existence.functional_states import chosen_states, fixed_modes, state_goals, without_faults
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.functional_filter.assembly import FilterPart, assembled, filter_part
 from obsynth.methods.functional_filter.filter_models import (
     with_noise_of_gains,
@@ -32,6 +32,7 @@ from obsynth.methods.functional_filter.kalman_gain import (
     whitening,
 )
 from obsynth.methods.functional_filter.method import FunctionalFilter
+from obsynth.methods.functional_filter.parity_relation import SAMPLES, is_large, relation_model
 from obsynth.methods.functional_filter.rates import MOST_LONGER, default_rates, settling_time
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
@@ -80,6 +81,9 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
         "stability": stability_factor(observer),
         "tracking": tracking_map(ErrorModel(plant, observer, t), model.Phi, model.Cw),
     }
+    low = [model for model, part in zip(models, parts, strict=True) if len(part.dynamics.C) < len(model.A)]
+    if low:
+        notes = (*notes, _low_order_note(plant, low))
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)
     slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"order": float(observer.order), **({"decay": slowest} if np.isfinite(slowest) else {})}
@@ -132,11 +136,42 @@ def _parts(
     parts, rates, step_times = [], [], []
     for model in models:
         require_noise(model, plant.output_names, plant.Dw)
-        walks, gain = _gain(plant, model, stated_rates, method, longer)
+        low = _low_order(plant, model, method)
+        if low is None:
+            walks, gain = _gain(plant, model, stated_rates, method, longer)
+        else:
+            model, walks, gain = low
         rates.append(walks)
         step_times += [] if gain.step_time_and_miss is None else [gain.step_time_and_miss]
         parts.append(filter_part(model, gain, whitening(gain.innovation), delay=method.delay, mean=method.mean))
     return parts, rates, step_times
+
+
+def _low_order_note(plant: DescriptorSystem, models: Sequence[FilterModel]) -> str:
+    names = ", ".join(plant.fault_names[fault] for model in models for fault in model.faults)
+    return (
+        f"The plant is large: the filter of {names} follows one parity relation over {SAMPLES} samples, not all "
+        f"{models[0].order} states, and has more noise than one that does. State fault_rate for that one."
+    )
+
+
+def _low_order(
+    plant: DescriptorSystem, model: FilterModel, method: FunctionalFilter
+) -> tuple[FilterModel, FloatArray, KalmanGain] | None:
+    """Return a model of low order with its walks and gain, where the plant is large, no option chooses the gains, and
+    steps are estimated as soon as they should be."""
+    if method.fault_rate is not None or method.decay is not None or not is_large(model):
+        return None
+    seconds = settling_time(plant)
+    low = relation_model(model, seconds)
+    if low is None:
+        return None
+    try:
+        walks, gain = default_rates(low, seconds, lag=method.delay, longer=0)
+    except SolverError:
+        return None
+    missed = np.inf if gain.step_time_and_miss is None else gain.step_time_and_miss[1]
+    return (low, walks, gain) if missed <= RATE_REACHED else None
 
 
 def _gain(
