@@ -91,3 +91,12 @@ def test_24_states_are_optimal(seed):
     least = obsynth.fault_estimation_filter(plant, weight="paper").certificate.claims["gamma"]
     assert level <= 1.001 * least
     assert paper.design().report.passed
+
+
+@pytest.mark.parametrize("seed", [11, 19])
+def test_dependent_measurements_leave_no_rounding_in_the_gain(seed):
+    # In the plant's coordinates rows of I - Upsilon W are dependent: 2e-15 in its rank made a gain that misses (45).
+    paper = obsynth.conditions.wang2015(random_plant(6, nd=3, seed=seed))
+    paper.problem.solve()
+    assert paper.problem.status == "optimal"
+    assert paper.problem._solution is None  # the smaller problem was enough

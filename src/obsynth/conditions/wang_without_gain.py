@@ -29,6 +29,7 @@ from obsynth.conditions.semidefinite_problem import SmallerProblem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, normalise, null_basis
+from obsynth.numerics.ranks import RANK_TOLERANCE
 
 #: Eigenvalues of -M below this share of the largest are no better known by the solution of a solver.
 SOLVED_SHARE = 1e-10
@@ -99,7 +100,9 @@ def wang_without_gain(
         R = X @ np.linalg.lstsq(scaled_H, scaled_G, rcond=None)[0].T
         change = np.linalg.solve(X, written_in.X)
         P_value = change.T @ value @ change
-        gain = np.linalg.solve(written_in.X, R @ written_in.V.T - written_in.R0) @ np.linalg.pinv(written_in.rest)
+        # Of the plant's own measurements the rows are dependent, and what rounding leaves of that must not be inverted.
+        back = np.linalg.pinv(written_in.rest, rcond=RANK_TOLERANCE)
+        gain = np.linalg.solve(written_in.X, R @ written_in.V.T - written_in.R0) @ back
         variables["P"].save_value((P_value + P_value.T) / 2.0)
         variables["Y"].save_value(P_value @ gain)
         if level is None:
