@@ -191,12 +191,14 @@ def number_in_text(text: str) -> float:
 
 def is_number(value: Any) -> bool:
     """Whether ``value`` is a single real number, of Python or numpy."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    # A length of time is a whole number for numpy, whatever its unit.
+    number = isinstance(value, (int, float, np.integer, np.floating))
+    return number and not isinstance(value, (bool, np.timedelta64))
 
 
 def is_whole(value: Any) -> bool:
     """Whether ``value`` is a single whole number, of Python or numpy."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
 
 
 def require_kind(

@@ -139,7 +139,7 @@ def identity_missed(product: FloatArray, size: FloatArray) -> float:
 
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
-    raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
+    raw = real_entries(as_given(value, name, f"{name} has rows of different lengths: give a full matrix."))
     truths = holds_truth(value)
     if raw.dtype.kind not in "fiu" or truths:
         if raw.size == 0:
@@ -158,6 +158,20 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         entry = matrix[row - 1, column - 1]
         raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
     return read_only(matrix)
+
+
+def real_entries(raw: NDArray[Any]) -> NDArray[Any]:
+    """Return an array of fractions, decimals or numbers of sympy in double precision, and one of complex numbers
+    without imaginary parts as its real part; any other as it is."""
+    if raw.dtype.kind == "c" and not np.any(raw.imag):
+        return np.asarray(raw.real)
+    if raw.dtype.kind != "O" or not raw.size or any(isinstance(entry, bool) for entry in raw.flat):
+        return raw
+    # Symbols without a value and complex numbers of sympy refuse, each in its own words.
+    try:
+        return np.array([float(entry) for entry in raw.flat if hasattr(entry, "__float__")]).reshape(raw.shape)
+    except (TypeError, ValueError, OverflowError):
+        return raw
 
 
 def _as_rows(vector: NDArray[Any], name: str) -> str:

@@ -6,6 +6,7 @@ Each of these libraries has its own class; what is common is asked for by name (
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,12 @@ from obsynth.errors import SpecError
 
 #: How a number is converted: ``to`` of pint and astropy (unyt has both).
 _NUMBER = ("magnitude", "value")
+
+#: How pint calls a unit of differences of temperature: ``delta_degC``.
+_DELTA = "delta_"
+
+#: Digits of the size of a degree that subtracting two temperatures of some hundred degrees leaves.
+_DIGITS_OF_DEGREES = 12
 
 #: What dimensionless units are called.
 _NO_UNIT = frozenset({"", "1", "dimensionless"})
@@ -45,8 +52,10 @@ def require_plain(value: Any, name: str) -> Any:
     )
 
 
-def in_unit(value: Any, unit: str | None, name: str) -> Any:
+def in_unit(value: Any, unit: str | None, name: str, *, is_difference: bool = False) -> Any:
     """Return a quantity as a number in the ``unit`` that a plant states; other values as they are.
+
+    A difference of temperatures, such as a deviation, has no zero: 0.1 K are 0.1 degC then.
 
     Raises
     ------
@@ -65,7 +74,7 @@ def in_unit(value: Any, unit: str | None, name: str) -> Any:
             path=name,
         )
     try:
-        return _number(value.to(unit))
+        return _difference(value, unit) if is_difference else _number(value.to(unit))
     except Exception as error:  # each library has its own errors, which share no base class
         raise SpecError(
             f"{name} is a quantity in {own}, which cannot be converted to {unit!r}, the unit of this signal: {error}",
@@ -73,8 +82,46 @@ def in_unit(value: Any, unit: str | None, name: str) -> Any:
         ) from error
 
 
+def in_seconds(value: Any, name: str) -> Any:
+    """Return a quantity of time, a `timedelta` or numpy's ``timedelta64`` as a number of seconds; other values as they
+    are."""
+    if isinstance(value, np.timedelta64):
+        return float(value / np.timedelta64(1, "s"))
+    return value.total_seconds() if isinstance(value, timedelta) else in_unit(value, "s", name)
+
+
+def numbers_in_units(given: Any, units: Mapping[str, str], name: str, *, are_differences: bool = False) -> Any:
+    """Return a mapping from signals, or from signals to mappings of numbers, with each quantity as a number in the unit
+    that is stated of its signal; anything else as it is."""
+
+    def number(value: Any, signal: str, place: str) -> Any:
+        return in_unit(value, units.get(signal), place, is_difference=are_differences)
+
+    if not isinstance(given, Mapping):
+        return given
+    return {
+        signal: {key: number(item, signal, f"{name}[{signal!r}].{key}") for key, item in value.items()}
+        if isinstance(value, Mapping)
+        else number(value, signal, f"{name}[{signal!r}]")
+        for signal, value in given.items()
+    }
+
+
 def _may_carry(value: Any) -> bool:
     return isinstance(value, (list, tuple)) or unit_of(value) is not None
+
+
+def _difference(value: Any, unit: str) -> Any:
+    """Return a difference as a number in ``unit``, which may be one that counts from a zero of its own."""
+    own = getattr(value, "units", getattr(value, "unit", None))
+    if str(own).startswith(_DELTA):
+        # As pint calls degrees of differences; others have none.
+        return _number(value.to(unit if unit.startswith(_DELTA) else f"{_DELTA}{unit}"))
+    nothing = _number(type(value)(0.0, own).to(unit))
+    if not nothing:
+        return _number(value.to(unit))
+    step = _number(type(value)(1.0, own).to(unit)) - nothing
+    return _number(value) * float(f"{step:.{_DIGITS_OF_DEGREES}g}")
 
 
 def _number(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_number, require_mapping, shape_problem, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
+from obsynth.numerics.quantities import in_seconds
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 from obsynth.plants.signal_names import is_name_list, raise_problems, require_known, rows_picking
 
@@ -94,6 +95,7 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
 
 def checked_dt(dt: Any) -> float:
     """Return a sampling time in seconds, 0 for continuous time."""
+    dt = in_seconds(dt, "dt")
     if not is_number(dt):
         raise SpecError(f"dt is {dt!r}: give the sampling time in seconds, or 0 for continuous time.", path="dt")
     if not is_finite_number(dt) or dt < 0:

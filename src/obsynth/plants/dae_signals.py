@@ -10,12 +10,13 @@ import numpy as np
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_given
+from obsynth.numerics.quantities import in_seconds
 from obsynth.plants.dae_fields import DAEFields
 
 
 def step_length(dt: Any) -> float:
     """Return the seconds between samples; raise `SpecError` unless they are a positive number."""
-    return real_number(dt, "dt", "the seconds between samples, a positive number", above=0.0)
+    return real_number(in_seconds(dt, "dt"), "dt", "the seconds between samples, a positive number", above=0.0)
 
 
 def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:

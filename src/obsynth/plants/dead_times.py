@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from datetime import timedelta
 from typing import Any
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, number_in_text, require_mapping, shown
 from obsynth.numerics.arrays import require_no_overflow
 from obsynth.numerics.measurement_units import MICRO_SIGNS
-from obsynth.numerics.quantities import in_unit
+from obsynth.numerics.quantities import in_seconds
 from obsynth.plants.signal_names import suggestion
 
 #: Seconds in the units of time that a text may have.
@@ -61,7 +60,7 @@ def seconds_of(value: Any, name: str) -> float:
     SpecError
         It is no such time, or it is negative.
     """
-    number = value.total_seconds() if isinstance(value, timedelta) else in_unit(value, "s", name)
+    number = in_seconds(value, name)
     if isinstance(number, str):
         number = _seconds_in_text(number, name)
     if not is_finite_number(number) or number < 0.0:

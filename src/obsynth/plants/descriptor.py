@@ -81,7 +81,7 @@ class DescriptorSystem:
         Noise ``(nx, nw)`` and ``(ny, nw)``: ``w`` is white with unit covariance, so the columns hold
         standard deviations (per sample for ``dt > 0``, and always per sample in ``Dw``).
     dt : float, optional
-        Seconds between samples; 0 for continuous time.
+        Seconds between samples, also as a `timedelta` or a quantity; 0 for continuous time.
     state_names, input_names, output_names, fault_names, disturbance_names, noise_names : list of str, optional
         Signal names; ``x1, x2, ...`` and so on by default.
     operating_point : mapping, optional

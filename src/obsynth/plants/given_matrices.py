@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.quantities import in_unit
+from obsynth.numerics.quantities import numbers_in_units
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.checking import (
     COUNTED_BY,
@@ -261,8 +261,6 @@ def in_stated_units(units: Any, **given: Any) -> list[Any]:
     """Return mappings from names of signals, with quantities in the units that are stated of these signals."""
     stated = units if isinstance(units, Mapping) else {}
     return [
-        {name: in_unit(value, stated.get(name), f"{kind}[{name!r}]") for name, value in mapping.items()}
-        if isinstance(mapping, Mapping)
-        else mapping
+        numbers_in_units(mapping, stated, kind, are_differences=kind == "sensor_noise")
         for kind, mapping in given.items()
     ]

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.numerics.measurement_units import MICRO_SIGNS
+from obsynth.numerics.quantities import in_seconds
 from obsynth.plants.dae_functions import BUTCHER
 from obsynth.plants.signal_names import index_of
 
@@ -115,7 +116,7 @@ def seconds(value: Any, path: str) -> float:
             return stated_number(float(match[1]) * SECONDS_OF_UNITS[match[2]], path)
         except ValueError:
             pass
-    return stated_number(value, path)
+    return stated_number(in_seconds(value, path), path)
 
 
 def stated_number(value: Any, path: str) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray, require_no_overflow
+from obsynth.numerics.quantities import numbers_in_units
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_signals import step_length
 from obsynth.plants.descriptor import DescriptorSystem
@@ -87,9 +88,14 @@ def with_noise(
     >>> made.plant.state_names, made.plant.A.tolist()
     (('x1', 'noise_y'), [[-1.0, 0.0], [0.0, -0.2]])
     """
-    names = plant.plant.output_names if isinstance(plant, Transformation) else plant.output_names
-    noises = sensor_noises(sensor_noise, names)
-    offsets = _offsets(() if offset is None else offset, names, noises)
+    own = plant.plant if isinstance(plant, Transformation) else plant
+    names = own.output_names
+    sizes, shifts = (
+        numbers_in_units(given, own.units, kind, are_differences=True)
+        for kind, given in (("sensor_noise", sensor_noise), ("offset", offset))
+    )
+    noises = sensor_noises(sizes, names)
+    offsets = _offsets(() if shifts is None else shifts, names, noises)
     loads = {name: stated_number(value, f"walks.{name}") for name, value in (walks or {}).items()}
     if isinstance(plant, DAEModel):
         model = _of_equations(plant, noises, offsets, loads)
