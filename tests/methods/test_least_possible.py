@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.optimal_filter.least_possible import least_possible, least_possible_of
+from obsynth.methods.optimal_filter.least_possible import LeastPossible, least_possible, least_possible_of
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 WANG = obsynth.load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
@@ -110,3 +110,11 @@ def test_shares_do_not_depend_on_the_unit_of_the_faults() -> None:
 
 def test_what_estimates_no_fault_has_no_least() -> None:
     assert least_possible(obsynth.guaranteed_test(WANG, fault="actuator 1", disturbance_bounds=0.1)) is None
+
+
+def test_a_least_gain_that_the_search_leaves_at_rounding_is_a_power_of_ten() -> None:
+    nothing = LeastPossible(0.5, 7.5e-7, 1.0, 1.0, (1,), 9.2e-7)
+    assert nothing.sentence().startswith(
+        "gain 0.5; least of any causal filter with delay 1: below 1e-6; with one sample more: below 1e-6;"
+    )
+    assert "below" not in LeastPossible(0.5, 0.0, 1.0, 1.0, (1,), 1e-4).sentence()

@@ -125,7 +125,7 @@ def test_a_quantity_in_the_noise_of_a_model_is_refused_instead_of_stripped():
     with pytest.raises(obsynth.SpecError, match=r"process_noise\.rate is a quantity in mV"):
         obsynth.with_noise(model, process_noise={"rate": size}, dt=0.1)
     for noise in (size, {"deviation": size}, {"deviation": 0.1, "correlation": 2.0, "white": size}):
-        with pytest.raises(obsynth.SpecError, match=r"sensor_noise\.y1.* is a quantity in mV"):
+        with pytest.raises(obsynth.SpecError, match=r"sensor_noise\['y1'\].* is a quantity in mV"):
             obsynth.with_noise(model, sensor_noise={"y1": noise})
 
 

@@ -172,6 +172,11 @@ def read_json(
     except (ValueError, RecursionError) as error:
         if path.suffix.lower() in (".yaml", ".yml"):
             problem = f"{path} is a spec, not a file that obsynth wrote. Run `obsynth design --system {path}` first."
+        elif path.suffix.lower() in (".html", ".htm"):
+            problem = (
+                f"{path} is a page for people to read. What is verified is the gain set that `obsynth design` wrote "
+                "beside it (.gains.json)."
+            )
         elif path.suffix.lower() == ".csv":
             problem = f"{path} is a table, not a file that obsynth wrote (JSON)."
         else:

@@ -31,6 +31,8 @@ from obsynth.verification.error_system import ErrorModel
 
 #: A gain below this share of what the disturbances do to the faults' estimates in one step is zero but for rounding.
 NOTHING = 1e-7
+#: Of a least gain below this share of another gain, the search leaves no digit: it ends at a small number, not at zero.
+TINY_SHARE = 1e-4
 #: A response is a delay where it differs by less than this.
 SAME_RESPONSE = 1e-6
 #: With more states nothing is computed: each search takes a second or more.
@@ -70,8 +72,9 @@ class LeastPossible(NamedTuple):
         said = []
         if self.gain or self.least_gain:
             alike = "with its response to the faults" if self.delay is None else _with_delay(self.delay)
-            said.append(f"gain {self.gain:.5g}; least of any causal filter {alike}: {_shown(self.least_gain)}")
-            said += [] if np.isnan(self.later_gain) else [f"with one sample more: {_shown(self.later_gain)}"]
+            least, later = (_in_words(gain, self.gain) for gain in (self.least_gain, self.later_gain))
+            said.append(f"gain {self.gain:.5g}; least of any causal filter {alike}: {least}")
+            said += [] if np.isnan(self.later_gain) else [f"with one sample more: {later}"]
         if np.isfinite(self.deviation_share):
             said.append(f"noise {self.deviation_share:.3g} times the least possible")
         return "; ".join(said)
@@ -81,8 +84,13 @@ def _with_delay(delay: tuple[int, ...]) -> str:
     return f"with delay {in_words(delay)}"
 
 
-def _shown(gain: float) -> str:
-    return "not known" if np.isnan(gain) else f"{gain:.5g}"
+def _in_words(least: float, beside: float) -> str:
+    """Return a least gain as a text: of one that is tiny beside another gain, the power of ten that it is below."""
+    if np.isnan(least):
+        return "not known"
+    if 0.0 < least < TINY_SHARE * beside:
+        return f"below 1e{int(np.ceil(np.log10(least)))}"
+    return f"{least:.5g}"
 
 
 def least_possible(design: ObserverDesign, *, later: bool = False) -> LeastPossible | None:
@@ -137,8 +145,8 @@ def least_possible_of(plant: DescriptorSystem) -> str:
     here, later = (_least(bounded, _map_of(delay, more=more), "hinf") for more in (0, 1))
     return (
         f"Least gain from the disturbances, held over each sample, to the fault estimates {_with_delay(delay)}, if the "
-        f"model is exact: {paper:.5g} with the paper's W (Wang 2015), {free:.5g} with a free W, {_shown(here)} of any "
-        f"causal filter; with one sample more: {_shown(later)}."
+        f"model is exact: {paper:.5g} with the paper's W (Wang 2015), {_in_words(free, paper)} with a free W, "
+        f"{_in_words(here, paper)} of any causal filter; with one sample more: {_in_words(later, paper)}."
     )
 
 
