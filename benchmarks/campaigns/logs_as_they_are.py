@@ -28,7 +28,7 @@ LIMIT = 1_800.0  # s
 #: Numbers of normal logs, and the share of healthy time in alarm that is allowed with each, and in the worst log.
 NORMAL_LOGS = {1: 0.05, 3: 0.02}
 WORST = 0.1
-CASES, FIRST_SEED = len(PLANTS), 100_000
+CASES, FIRST_SEED = len(PLANTS), 200_000
 HEALTHY, FAULTY, START, CALIBRATED = 3, 1, 50, 400
 #: Faults walk by their size over this in a row; one false alarm in so many rows; the user's margin.
 WALK, RATE, MARGIN = 30.0, "1 per 3500 rows", 1.05
