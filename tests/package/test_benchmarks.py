@@ -111,6 +111,12 @@ def test_the_unknown_input_observer_benchmark_runs(small_table):
     assert min(rates[:3]) > max(rates[3], 0.0)
 
 
+@pytest.mark.long
+def test_the_optimal_filter_benchmark_runs(small_table):
+    rows = small_table("optimal_filter")
+    assert [row[:2] for row in rows] == [["one", "3"], ["every state", "3"]]
+
+
 def test_the_pd_observer_benchmark_runs(small_table):
     rows = small_table("pd_observer")
     assert [row[0] for row in rows] == ["6"]

@@ -23,11 +23,10 @@ import flint
 import numpy as np
 import scipy.linalg
 
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
-
-Model = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+from obsynth.verification.worst_invisible import Directions, Kernel, Model, Shown, kernel, worst_directions
 
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
 PRECISION_BITS = (256, 768)
@@ -41,6 +40,9 @@ LEVEL_ABOVE, REGULAR_SHARE = 1e-9, 1e-40
 NEWTON_STEPS, BOX_BITS = 8, 0.6
 #: A bound for all delays is lowered by this share: that covers so many samples of delay.
 LIMIT_SHARE, LONGEST_DELAY = 1e-5, 1000
+#: A bound of the worst direction of each point is taken where it is this near, as a share, to the ratio that double
+#: precision has for it: more would be claimed of no bound.
+SAME_RATIO = 1.0 - 1e-9
 #: Columns of signals that are smaller beside the others, in double precision, are left out.
 DEPENDENT_SHARE = 1e-12
 #: Dependent equations of last samples with more unknowns than this are not solved in rational numbers.
@@ -115,15 +117,68 @@ def proved_least(
     """
     if plant.is_discrete and (samples < max(setting.longest, 1) or not has_index_one(plant)):
         return None
+    samples = samples if plant.is_discrete else 0
+    bound = _of_worst_directions(plant, points, samples, setting, level if enough is None else enough)
+    if bound is not None:
+        return bound
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                bound = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level, enough)
+                bound = _Trajectories(plant, points, samples, setting).bound(level, enough)
             except ZeroDivisionError:  # a matrix is singular to these digits
                 continue
         if bound is not None:
             return bound
     return None
+
+
+def _of_worst_directions(
+    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, enough: float
+) -> float | None:
+    """Return the proved ratio of one direction of each point, where it is enough, or near that of all directions."""
+    try:
+        directions = _directions(plant, points, samples, setting)
+        if directions is None:
+            return None
+        with flint.ctx.workprec(PRECISION_BITS[0]):
+            bound = _Trajectories(plant, points, samples, setting, directions=directions).bound(None, 0.0)
+    except (ZeroDivisionError, np.linalg.LinAlgError):
+        return None
+    needed = enough if enough > 0.0 else directions.ratio * SAME_RATIO
+    return bound if bound is not None and bound >= needed else None
+
+
+def _directions(
+    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting
+) -> Directions | None:
+    """Return the worst directions in double precision; ``None`` where points have one signal each, or none."""
+    (bh, dh), (bw, dw) = hidden_and_bounded(plant, setting)
+    still, moved = _pencil(plant, np.hstack([bh, bw]), np.hstack([dh, dw]))
+    if still.shape[1] <= len(still):
+        return None
+    kernels = dict[complex, Kernel]()
+    for point in points:
+        above = complex(point.real, abs(point.imag))
+        matrix = still + above * moved if above.imag else still + above.real * moved
+        kernels[above] = kernel(matrix, *_pivots(matrix))
+    nx, nf, nh = plant.nx, plant.nf, bh.shape[1]
+    first = nx if setting.exact else nx + nh
+    shown = Shown(slice(first, first + nf), slice(nx + nh, still.shape[1]))
+    inputs, free = list[FloatArray](), np.zeros((0, 0))
+    if samples:
+        system, places = _system_from_rest(plant, (bh, dh), (bw, dw), samples)
+        rest = kernel(system, *_pivots(system))
+        first = 0 if setting.exact else nh
+        inputs, free = [np.asarray(rest.columns[place])[first:] for place in places], np.asarray(rest.free)
+    return worst_directions(kernels, (inputs, free), shown, setting.models, setting.delays, discrete=plant.is_discrete)
+
+
+def _pencil(plant: DescriptorSystem, inputs: FloatArray, through: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the pencil ``still + s moved`` whose kernel no output shows."""
+    still = np.block([[-plant.A, -inputs], [plant.C, through]])
+    moved = np.zeros_like(still)
+    moved[: plant.nx, : plant.nx] = plant.E
+    return still, moved
 
 
 def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> float | None:
@@ -155,6 +210,11 @@ def _complex(matrix: Any) -> Any:
     """Return a matrix of floating-point numbers as python-flint's, exactly."""
     rows, columns = np.shape(matrix)
     return flint.acb_mat(rows, columns, np.ravel(matrix).tolist())
+
+
+def _real(matrix: FloatArray) -> Any:
+    rows, columns = matrix.shape
+    return flint.arb_mat(rows, columns, matrix.ravel().tolist())
 
 
 def _zeros(rows: int, columns: int) -> Any:
@@ -200,10 +260,15 @@ class _Trajectories:
         setting: Setting,
         *,
         conjugates: bool = True,
+        directions: Directions | None = None,
     ) -> None:
-        self.plant, self.setting, self.samples = plant, setting, samples
+        self.plant, self.setting, self.samples, self.directions = plant, setting, samples, directions
         (self.Bh, self.Dh), (self.Bw, self.Dw) = hidden_and_bounded(plant, setting)
         self.members: list[_Member] = []
+        if directions is not None:
+            for point, free in directions.of_points.items():
+                self.members += self._along(point, free)
+            return
         for point in _with_conjugates(points) if conjugates else points:
             new_members = self._members(point)
             # Two starts may lead to one zero.
@@ -214,9 +279,7 @@ class _Trajectories:
 
     def _members(self, point: complex) -> list[_Member]:
         plant, nx = self.plant, self.plant.nx
-        still = np.block([[-plant.A, -self.Bh, -self.Bw], [plant.C, self.Dh, self.Dw]])
-        moved = np.zeros_like(still)
-        moved[:nx, :nx] = plant.E
+        still, moved = _pencil(plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
         free = still.shape[1] - len(still)
         if free < 0:
             return []
@@ -234,6 +297,18 @@ class _Trajectories:
         nh, nw = self.Bh.shape[1], self.Bw.shape[1]
         counted = [*range(nx, nx + (plant.nf if self.setting.exact else 0)), *range(nx + nh, nx + nh + nw)]
         return [_Member(flint.acb(point), vectors[j]) for j in _independent(_rows(_beside(vectors), counted))]
+
+    def _along(self, point: complex, free: ComplexArray) -> list[_Member]:
+        """Return the signal of a point with these free entries, and its conjugate."""
+        still, moved = _pencil(self.plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
+        pivots, others = _pivots(still + point * moved)
+        if point.imag:
+            exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
+            vector = _with_free(exact, pivots, others, _complex(free[:, None]))
+            return [_Member(flint.acb(point), vector), _Member(flint.acb(point.conjugate()), vector.conjugate())]
+        exact = _real(still) + _real(moved) * flint.arb(point.real)
+        vector = _with_free(exact, pivots, others, _real(free.real[:, None]))
+        return [_Member(flint.acb(point.real), flint.acb_mat(vector))]
 
     def _part(self, which: str) -> Any:
         """Return a part of the members' vectors, one member a column."""
@@ -263,7 +338,8 @@ class _Trajectories:
         if not self.samples:
             return energies[0], energies[1]
         estimated = self.plant.nf if self.setting.exact else 0
-        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples, estimated)
+        free = None if self.directions is None else self.directions.of_samples
+        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples, estimated, free=free)
         # The members go on, and what starts from rest is added to them.
         own = 0 if self.setting.exact else self.Bh.shape[1]
         tails, powers = [], [flint.acb(1) for _ in points]
@@ -361,11 +437,37 @@ def _from_rest(
     noise: tuple[FloatArray, FloatArray],
     samples: int,
     estimated: int,
+    *,
+    free: FloatArray | None = None,
 ) -> list[Any]:
     """Return the inputs ``(h, w)`` of each sample, solutions from rest with y = 0 as columns.
 
-    Of these, what is independent in w and the first ``estimated`` of h, the faults.
+    Of these, what is independent in w and the first ``estimated`` of h, the faults; or the one with some free entries.
     """
+    system, places = _system_from_rest(plant, hidden, noise, samples)
+    if free is not None:
+        one = flint.acb_mat(_with_free(_real(system), *_pivots(system), _real(free[:, None])))
+        return [_rows(one, place) for place in places]
+    try:
+        pivots, others = _pivots(system)
+        solved = _columns(_complex(system + 0j), pivots).solve(-_columns(_complex(system + 0j), others))
+        columns = [_placed(solved, pivots, others, j) for j in range(len(others))]
+        solutions = _beside(columns) if columns else _zeros(system.shape[1], 0)
+    except ZeroDivisionError:
+        solutions = exact_kernel(system)
+    parts = [_rows(solutions, place) for place in places]
+    counted = [*range(estimated), *range(hidden[0].shape[1], len(places[0]))]
+    independent = _independent(_stacked([_rows(part, counted) for part in parts]))
+    return [_columns(part, independent) for part in parts]
+
+
+def _system_from_rest(
+    plant: DescriptorSystem,
+    hidden: tuple[FloatArray, FloatArray],
+    noise: tuple[FloatArray, FloatArray],
+    samples: int,
+) -> tuple[FloatArray, list[range]]:
+    """Return the equations of last samples from rest with y = 0, and where the inputs of each are in the unknowns."""
     nx, ny = plant.nx, plant.ny
     (bh, dh), (bw, dw) = hidden, noise
     inputs, through = np.hstack([bh, bw]), np.hstack([dh, dw])
@@ -374,6 +476,7 @@ def _from_rest(
     loose = [i for i in range(nx) if not plant.E[:, i].any()]
     block = count + nx
     system = np.zeros((samples * (nx + ny), len(loose) + samples * block))
+    places = []
     for j in range(samples):
         row, own = j * (nx + ny), len(loose) + j * block
         states, outputs = slice(row, row + nx), slice(row + nx, row + nx + ny)
@@ -383,18 +486,8 @@ def _from_rest(
         )
         system[states, own : own + count], system[outputs, own : own + count] = -inputs, through
         system[states, own + count : own + block] = plant.E
-    system = system[system.any(axis=1)]
-    try:
-        pivots, others = _pivots(system)
-        solved = _columns(_complex(system + 0j), pivots).solve(-_columns(_complex(system + 0j), others))
-        columns = [_placed(solved, pivots, others, j) for j in range(len(others))]
-        kernel = _beside(columns) if columns else _zeros(system.shape[1], 0)
-    except ZeroDivisionError:
-        kernel = exact_kernel(system)
-    parts = [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
-    counted = [*range(estimated), *range(bh.shape[1], count)]
-    independent = _independent(_stacked([_rows(part, counted) for part in parts]))
-    return [_columns(part, independent) for part in parts]
+        places.append(range(own, own + count))
+    return system[system.any(axis=1)], places
 
 
 def _independent(matrix: Any) -> list[int]:
@@ -458,7 +551,14 @@ def _pivots(matrix: Any) -> tuple[list[int], list[int]]:
 
 def _columns(matrix: Any, columns: Sequence[int]) -> Any:
     table = matrix.tolist()
-    return flint.acb_mat(len(table), len(columns), [row[j] for row in table for j in columns])
+    return type(matrix)(len(table), len(columns), [row[j] for row in table for j in columns])
+
+
+def _with_free(matrix: Any, pivots: Sequence[int], others: Sequence[int], free: Any) -> Any:
+    """Return the solution of the equations whose free entries are given, a column."""
+    solved = _columns(matrix, pivots).solve(-(_columns(matrix, others) * free))
+    entries = dict(zip([*pivots, *others], [*solved.entries(), *free.entries()], strict=True))
+    return type(matrix)(len(entries), 1, [entries[place] for place in range(len(entries))])
 
 
 def _placed(solved: Any, pivots: Sequence[int], others: Sequence[int], which: int) -> Any:
