@@ -57,7 +57,10 @@ def test_the_gain_is_that_of_a_convex_programme_over_four_samples() -> None:
     assert 1.0 - 1e-9 <= design.least <= 1.0 <= design.gain <= 1.002
 
 
-@pytest.mark.parametrize(("seed", "norm"), [(0, "hinf"), pytest.param(1, "hinf", marks=pytest.mark.long), (1, "h2")])
+@pytest.mark.parametrize(
+    ("seed", "norm"),
+    [pytest.param(0, "hinf", marks=pytest.mark.long), pytest.param(1, "hinf", marks=pytest.mark.long), (1, "h2")],
+)
 def test_a_filter_of_fewer_states_keeps_fault_map_and_decoupling(seed: int, norm: str, tmp_path) -> None:
     case = plant(seed, nd=1)
     full = obsynth.optimal_filter(case, delay=1, decoupled="d1", norm=norm)
