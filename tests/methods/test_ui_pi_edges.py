@@ -92,7 +92,7 @@ def test_a_rate_far_above_the_plants_own_is_reached(decay: float, joint: bool) -
 
 def test_a_rate_at_which_rounding_moves_the_estimate_says_so() -> None:
     """With the fault models in one observer, of a plant that leaves under a constant fault: proved of its errors."""
-    design = ui_pi_observer(PAPER, decay=3e3, joint=True)
+    design = ui_pi_observer(PAPER, decay=1e4, joint=True)
     row = design.report["constant fault"]
     assert row.passed
     assert "errors alone, in exact arithmetic" in row.detail
@@ -108,7 +108,8 @@ def test_gains_that_drown_a_unit_fault_in_rounding_are_no_design(decay: float, j
 
 def test_a_rate_is_had_where_rounding_ends_the_riccati_equation(monkeypatch: pytest.MonkeyPatch) -> None:
     # On one machine it ended at 1e5 1/s and an error was raised, on all others gains were found and judged.
-    monkeypatch.setattr(KalmanProblem, "gain", lambda *given, **options: None)
+    for name in ("gain", "quietest_gain"):
+        monkeypatch.setattr(KalmanProblem, name, lambda *given, **options: None)
     design = ui_pi_observer(PAPER, decay=1e4)
     assert design.report.passed
     assert design.certificate.claims["decay"] >= 1e4
