@@ -103,7 +103,10 @@ class ComparedLog:
             require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
         measured = (*plant.input_names, *plant.output_names)
         column_of = {name: (columns or {}).get(name, name) for name in (*measured, *plant.fault_names)}
-        table, _, remarks = log_table(data, list(column_of.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
+        scaled = {*(scales or {}), *plant.scales}
+        units = {column: plant.units[name] for name, column in column_of.items() if name in {*plant.units} - scaled}
+        time = (columns or {}).get(TIME_HEADER, TIME_HEADER)
+        table, _, remarks = log_table(data, list(column_of.values()), time, units=units)
         frame = {name: table[column] for name, column in column_of.items() if column in table}
         shift = None if plant.uncertainty is None else plant.uncertainty.shift
         if shift and frame:
@@ -133,7 +136,7 @@ class ComparedLog:
             truth[:, plant.fault_names.index(name)] = frame[name]
         u, y = signals(plant.input_names), signals(plant.output_names)
         u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
-        stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
+        stamps = table.get(time)
         stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
         times = _clock(count, plant.dt) if stamps is None else stamps
         return Record(times, u, y, truth, tuple(known_faults), (*remarks, *stuck_texts(stuck)))

@@ -213,7 +213,16 @@ def calibrate(
     model = _loads_as_parameters(require_plant(model), walks)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
     seconds = _sample_time(model, dt, substeps)
-    read = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=factors, dt=seconds)
+    read = read_log(
+        log,
+        model.input_names,
+        model.output_names,
+        rows=rows,
+        columns=columns,
+        scales=factors,
+        dt=seconds,
+        units=model.units,
+    )
     record = _usable(read, input_delay)
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, record)
     noise_model = asked_states(sensor_noise, offset, walks, model.output_names)

@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -170,10 +171,12 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     dt: float | None = None,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> RecordedLog:
     """Return the rows of a log as inputs and outputs on a grid. A log is a CSV or Parquet file, a data frame, or a
     mapping from names to columns; ``columns`` says which column a signal (or ``time``) is in where the names differ,
-    ``scales`` what its values are multiplied by."""
+    ``scales`` what its values are multiplied by; where nothing does, values in another unit than the signal's of
+    ``units`` are converted, or refused, by the header."""
     if isinstance(log, RecordedLog):
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
@@ -187,12 +190,14 @@ def read_log(
                 f"{option} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
                 path=f"{option}.{wrong[0]}",
             )
-    table, names, source, notes = _table(log, [(columns or {}).get(name, name) for name in signals])
+    held = {name: (columns or {}).get(name, name) for name in signals}
+    own = {held[name]: unit for name, unit in units.items() if name in held and name not in (scales or {})}
+    table, names, source, notes = _table(log, list(held.values()), own)
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
     def column(name: str) -> FloatArray:
-        wanted = (columns or {}).get(name, name)
+        wanted = held[name]
         if wanted not in table:
             raise SpecError(
                 f"The log has no column {wanted!r} for {name!r}: there are {', '.join(names)}.", path=f"columns.{name}"
@@ -200,7 +205,7 @@ def read_log(
         numbers = _numbers(table[wanted], wanted, length)[first:last]
         return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
 
-    in_table = (columns or {}).get("time", "time") in table
+    in_table = held["time"] in table
     if not in_table and dt is None:
         raise SpecError(
             f"The log has no column 'time'; it has {', '.join(map(repr, names))}. "
@@ -218,12 +223,14 @@ def read_log(
     return replace(record, notes=(*notes, *record.notes, *stuck_texts(stuck)))
 
 
-def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
+def _table(
+    log: Any, wanted: Sequence[str], units: Mapping[str, str]
+) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
     """Return columns that are wanted, the time first, names of all columns, where they come from, and what is to be
     said of their cells."""
     log = log if isinstance(log, str | Path | Mapping) else as_frame(log)
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
-        columns, names, notes = log_table(log, wanted[1:], wanted[0])
+        columns, names, notes = log_table(log, wanted[1:], wanted[0], units=units)
         return columns, names, Path(log).name if isinstance(log, str | Path) else "", notes
     if isinstance(log, Mapping):
         columns = {str(name): np.atleast_1d(np.asarray(log[name])) for name in log}
@@ -235,7 +242,7 @@ def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], 
             import pandas as pd
 
             # Cells with words are read as those of a frame.
-            read, _, notes = log_table(pd.DataFrame(wanted_columns), wanted[1:], wanted[0])
+            read, _, notes = log_table(pd.DataFrame(wanted_columns), wanted[1:], wanted[0], units=units)
             return {**columns, **read}, list(map(str, log)), "", notes
         return columns, list(map(str, log)), "", ()
     raise SpecError(

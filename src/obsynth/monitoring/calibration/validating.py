@@ -369,7 +369,14 @@ def _usable_log(
     plant = design.plant
     factors = dict(getattr(plant, "scales", {})) | dict(scales or {})
     record = read_log(
-        log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors, dt=design.observer.dt
+        log,
+        plant.input_names,
+        plant.output_names,
+        rows=rows,
+        columns=columns,
+        scales=factors,
+        dt=design.observer.dt,
+        units=plant.units,
     )
     if record.samples < LEAST_VALIDATED_ROWS:
         raise SpecError(

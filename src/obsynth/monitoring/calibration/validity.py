@@ -169,7 +169,9 @@ def validity(
         raise SpecError(
             "The linear model is of another plant, or sampled: give what obsynth.linearise returns.", path="linear"
         )
-    record = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
+    record = read_log(
+        log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt, units=model.units
+    )
     point = linear.operating_point
     center = np.array([point[name] for name in linear.state_names])
     start = (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,11 +33,15 @@ SECOND_DECIMALS = 6
 
 
 def log_table(
-    data: str | Path | Any, names: Sequence[str], time: str = TIME_HEADER
+    data: str | Path | Any,
+    names: Sequence[str],
+    time: str = TIME_HEADER,
+    *,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[dict[str, FloatArray], list[str], tuple[str, ...]]:
     """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, the names of all
     columns, and what is to be said of the cells; ``data`` is the name of a file or a data frame, ``time`` the column of
-    the stamps."""
+    the stamps, ``units`` those that columns are converted to from what the header says."""
     data = data if isinstance(data, str | Path) else as_frame(data)
     header = _header(data, [time, *names])
     present = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
@@ -45,7 +50,8 @@ def log_table(
     first = time if has_stamps else next(iter(present), None)
     if first is None:
         return {}, header, ()
-    signals = LogSignals(tuple(present), (first, *present), np.ones(len(present)), np.zeros(len(present)), {})
+    ones, zeros = np.ones(len(present)), np.zeros(len(present))
+    signals = LogSignals(tuple(present), (first, *present), ones, zeros, {}, units=units)
     stamps = Stamps()
     stamps.are_missing = not has_stamps
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
