@@ -89,3 +89,23 @@ def test_matrices_of_other_real_numbers_are_read(matrix: Any) -> None:
 def test_what_is_no_real_number_is_refused(entry: Any) -> None:
     with pytest.raises(obsynth.SpecError, match="every entry must be"):
         obsynth.DescriptorSystem(A=[[entry]], C=[[1.0]], Bf=[[1.0]])
+
+
+@pytest.mark.parametrize("entry", [np.complex128(1 + 2j), np.True_, np.str_("3"), UNITS.Quantity(1.0, "ms/s")])
+def test_one_entry_that_is_no_real_number_is_refused_beside_others(entry: Any) -> None:
+    rows = np.empty((1, 1), dtype=object)
+    rows[0, 0] = entry
+    with pytest.raises(obsynth.SpecError, match="A holds"):
+        obsynth.DescriptorSystem(A=rows, C=[[1.0]], Bf=[[1.0]])
+
+
+@pytest.mark.parametrize("length", [np.timedelta64(1, "M"), np.timedelta64(300)])
+def test_a_length_of_time_without_seconds_is_refused(length: Any) -> None:
+    with pytest.raises(obsynth.SpecError, match="no number of seconds"):
+        obsynth.DescriptorSystem(**PLANT, delays={"y1": length})
+
+
+def test_degrees_of_a_difference_are_kelvins() -> None:
+    noise = {"y1": UNITS.Quantity(0.1, "delta_degC")}
+    plant = obsynth.DescriptorSystem(**PLANT, units={"y1": "K"}, sensor_noise=noise)
+    assert plant.Dw[0, 0] == pytest.approx(0.1)

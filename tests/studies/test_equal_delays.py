@@ -104,3 +104,12 @@ def test_effects_of_a_scenario_are_added_at_every_place(size: float, delay: floa
     fault[20:] = size
     effects[:, 24:] = size
     assert delay_of_scenario(np.full(500, 7.0), effects, fault, 2.0, 7.0, 1.0) == delay
+
+
+def test_a_value_that_is_beyond_the_level_by_chance_is_no_alarm() -> None:
+    rng, times = np.random.default_rng(3), np.arange(2000.0)
+    values, fault = rng.standard_normal(2000), np.where(times >= 1000, 1.0, 0.0)
+    values[1800:] += 6.0
+    fault[990:1000] = np.nan
+    delay = delay_on_log(values, times, fault, 0.0, float(np.quantile(np.abs(values[:990]), 0.99)))
+    assert 780.0 <= delay <= 800.0

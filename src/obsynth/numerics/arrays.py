@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError, counted
-from obsynth.numerics.quantities import require_plain
+from obsynth.numerics.quantities import require_plain, unit_of
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -165,13 +165,18 @@ def real_entries(raw: NDArray[Any]) -> NDArray[Any]:
     without imaginary parts as its real part; any other as it is."""
     if raw.dtype.kind == "c" and not np.any(raw.imag):
         return np.asarray(raw.real)
-    if raw.dtype.kind != "O" or not raw.size or any(isinstance(entry, bool) for entry in raw.flat):
+    if raw.dtype.kind != "O" or not raw.size or any(map(_is_no_real_number, raw.flat)):
         return raw
     # Symbols without a value and complex numbers of sympy refuse, each in its own words.
     try:
         return np.array([float(entry) for entry in raw.flat if hasattr(entry, "__float__")]).reshape(raw.shape)
     except (TypeError, ValueError, OverflowError):
         return raw
+
+
+def _is_no_real_number(entry: Any) -> bool:
+    """Whether numpy makes a number of an entry that is none: truths, texts, complex numbers, and quantities."""
+    return isinstance(entry, (bool, np.bool_, str, np.complexfloating)) or unit_of(entry) is not None
 
 
 def _as_rows(vector: NDArray[Any], name: str) -> str:

@@ -6,6 +6,7 @@ Each of these libraries has its own class; what is common is asked for by name (
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import timedelta
 from typing import Any
 
@@ -18,6 +19,9 @@ _NUMBER = ("magnitude", "value")
 
 #: How pint calls a unit of differences of temperature: ``delta_degC``.
 _DELTA = "delta_"
+
+#: What numpy counts time in that has no length in seconds: months, years, and no unit at all.
+_NO_LENGTH = frozenset({"Y", "M", "generic"})
 
 #: Digits of the size of a degree that subtracting two temperatures of some hundred degrees leaves.
 _DIGITS_OF_DEGREES = 12
@@ -86,6 +90,8 @@ def in_seconds(value: Any, name: str) -> Any:
     """Return a quantity of time, a `timedelta` or numpy's ``timedelta64`` as a number of seconds; other values as they
     are."""
     if isinstance(value, np.timedelta64):
+        if np.datetime_data(value.dtype)[0] in _NO_LENGTH:
+            raise SpecError(f"{name} is {value!r}, which is no number of seconds: give it in s or ms.", path=name)
         return float(value / np.timedelta64(1, "s"))
     return value.total_seconds() if isinstance(value, timedelta) else in_unit(value, "s", name)
 
@@ -115,8 +121,10 @@ def _difference(value: Any, unit: str) -> Any:
     """Return a difference as a number in ``unit``, which may be one that counts from a zero of its own."""
     own = getattr(value, "units", getattr(value, "unit", None))
     if str(own).startswith(_DELTA):
-        # As pint calls degrees of differences; others have none.
-        return _number(value.to(unit if unit.startswith(_DELTA) else f"{_DELTA}{unit}"))
+        # As pint calls degrees of differences; kelvins are their own.
+        with suppress(Exception):  # each library has its own errors, which share no base class
+            return _number(value.to(unit))
+        return _number(value.to(f"{_DELTA}{unit}"))
     nothing = _number(type(value)(0.0, own).to(unit))
     if not nothing:
         return _number(value.to(unit))
