@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.corruptions import with_claims, with_matrices
 from tests.support.polytopic_plants import record, wang
 
 import obsynth
 from obsynth import ObserverDesign, PolytopicSystem, PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.design import Certificate
 
 NOISE: dict[str, Any] = {"Q": np.diag([0.1, 0.1, 0.1, 1e-3]).tolist(), "R": 0.01}
 
@@ -95,16 +95,6 @@ def test_estimates_follow_without_noise(singular: ObserverDesign) -> None:
     assert found.states[-1][0] == pytest.approx(first, abs=1e-6)
 
 
-def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
-
-
-def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
-
-
 def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
     data = {**design.scheduled[1].as_dict(), **changed}
     return design.replace(observer=type(design.scheduled[1]).from_dict(data))
@@ -113,20 +103,21 @@ def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
 _DEVIATION, _DECAY = "mean square over the region", "decay over the region"
 _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] = {
     "smaller number": (
-        lambda d: _claims(d, region_deviation=0.99 * d.certificate.claims["region_deviation"]), _DEVIATION,
+        lambda d: with_claims(d, region_deviation=0.99 * d.certificate.claims["region_deviation"]), _DEVIATION,
     ),
-    "faster decay": (lambda d: _claims(d, region_decay=0.5 * d.certificate.claims["region_decay"]), _DECAY),
-    "no number": (lambda d: _claims(d, region_deviation=float("nan")), _DEVIATION),
-    "another P": (lambda d: _matrices(d, P_region=0.5 * d.certificate.matrices["P_region"]), _DEVIATION),
+    "faster decay": (lambda d: with_claims(d, region_decay=0.5 * d.certificate.claims["region_decay"]), _DECAY),
+    "no number": (lambda d: with_claims(d, region_deviation=float("nan")), _DEVIATION),
+    "another P": (lambda d: with_matrices(d, P_region=0.5 * d.certificate.matrices["P_region"]), _DEVIATION),
     "P is not symmetric": (
-        lambda d: _matrices(d, P_region=d.certificate.matrices["P_region"] + np.array([[0, 1e-9], [0, 0]])), _DEVIATION,
+        lambda d: with_matrices(d, P_region=d.certificate.matrices["P_region"] + np.array([[0, 1e-9], [0, 0]])),
+        _DEVIATION,
     ),
     "more noise": (lambda d: d.replace(options={**d.options, "R": [[0.2]]}), _DEVIATION),
     "noise that is none": (lambda d: d.replace(options={**d.options, "R": [[-0.2]]}), "fits the plant"),
     "another tracking": (
-        lambda d: _matrices(d, tracking=1.001 * d.certificate.matrices["tracking"]), "unbiased: dynamics",
+        lambda d: with_matrices(d, tracking=1.001 * d.certificate.matrices["tracking"]), "unbiased: dynamics",
     ),
-    "no tracking": (lambda d: _matrices(d, tracking=np.zeros((1, 2))), "fits the plant"),
+    "no tracking": (lambda d: with_matrices(d, tracking=np.zeros((1, 2))), "fits the plant"),
     "another gain": (lambda d: _observer(d, By=1.001 * d.scheduled[1].By), "unbiased: dynamics"),
     "another input": (lambda d: _observer(d, Bu=1.001 * d.scheduled[1].Bu), "unbiased: inputs"),
     "another estimate": (lambda d: _observer(d, Dy=1.001 * d.scheduled[1].Dy), "unbiased: state"),

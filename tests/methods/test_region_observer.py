@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from tests.support.corruptions import with_claims, with_matrices, with_observer
 
 import obsynth
 from obsynth import DAEModel, ObserverDesign, PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.region_observer import RegionObserver
-from obsynth.results.design import Certificate
 
 #: The region of the two tanks, and their noise.
 REGION = {"h2": [0.1, 0.6], "h1 - h2": [0.02, 0.55]}
@@ -180,53 +180,39 @@ def test_a_flexible_joint_has_no_limit_of_its_slope_and_units_do_not_matter() ->
     assert levels[0] == pytest.approx(levels[1], rel=0.02)
 
 
-def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
-
-
-def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
-
-
-def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    return design.replace(observer=replace(design.observer, **changed))  # type: ignore[type-var]
-
-
 def _scaled(design: ObserverDesign, name: str, factor: float) -> float:
     return factor * design.certificate.claims[name]
 
 
 _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] = {
     "wider region": (
-        lambda d: _observer(d, region={"h2": [0.05, 0.6], "h1 - h2": [0.02, 0.55]}), "slopes over the region",
+        lambda d: with_observer(d, region={"h2": [0.05, 0.6], "h1 - h2": [0.02, 0.55]}), "slopes over the region",
     ),
-    "narrower slopes": (lambda d: _observer(d, slopes=0.999 * d.over_region[1].slopes), "slopes over the region"),
+    "narrower slopes": (lambda d: with_observer(d, slopes=0.999 * d.over_region[1].slopes), "slopes over the region"),
     "wider slopes": (
-        lambda d: _observer(d, slopes=d.over_region[1].slopes + np.array([[-0.5, 0.5]])), "decay over the region",
+        lambda d: with_observer(d, slopes=d.over_region[1].slopes + np.array([[-0.5, 0.5]])), "decay over the region",
     ),
-    "changed gain": (lambda d: _observer(d, gain=2.0 * d.over_region[1].gain), "mean square over the region"),
-    "no gain": (lambda d: _observer(d, gain=0.0 * d.over_region[1].gain), "decay over the region"),
+    "changed gain": (lambda d: with_observer(d, gain=2.0 * d.over_region[1].gain), "mean square over the region"),
+    "no gain": (lambda d: with_observer(d, gain=0.0 * d.over_region[1].gain), "decay over the region"),
     "smaller deviation": (
-        lambda d: _claims(d, region_deviation=_scaled(d, "region_deviation", 0.9)), "mean square over the region",
+        lambda d: with_claims(d, region_deviation=_scaled(d, "region_deviation", 0.9)), "mean square over the region",
     ),
-    "no number": (lambda d: _claims(d, region_deviation=float("nan")), "mean square over the region"),
-    "faster decay": (lambda d: _claims(d, region_decay=_scaled(d, "region_decay", 1.2)), "decay over the region"),
+    "no number": (lambda d: with_claims(d, region_deviation=float("nan")), "mean square over the region"),
+    "faster decay": (lambda d: with_claims(d, region_decay=_scaled(d, "region_decay", 1.2)), "decay over the region"),
     "asymmetric P": (
-        lambda d: _matrices(d, P_region=d.certificate.matrices["P_region"] + 1e-9 * np.eye(4, k=1)),
+        lambda d: with_matrices(d, P_region=d.certificate.matrices["P_region"] + 1e-9 * np.eye(4, k=1)),
         "decay over the region",
     ),
     "G of another structure": (
-        lambda d: _matrices(d, G_gain=d.certificate.matrices["G_gain"] + np.eye(4, k=3)),
+        lambda d: with_matrices(d, G_gain=d.certificate.matrices["G_gain"] + np.eye(4, k=3)),
         "mean square over the region",
     ),
     "algebraic part of G": (
-        lambda d: _matrices(d, G_region=d.certificate.matrices["G_region"] * np.diag([1, 1, 1, -1.0])
+        lambda d: with_matrices(d, G_region=d.certificate.matrices["G_region"] * np.diag([1, 1, 1, -1.0])
                             + d.certificate.matrices["G_region"] * (1 - np.eye(4))),
         "index 1 over the region",
     ),
-    "P of other order": (lambda d: _matrices(d, P_region=np.eye(3)[None]), "decay over the region"),
+    "P of other order": (lambda d: with_matrices(d, P_region=np.eye(3)[None]), "decay over the region"),
     "less noise": (
         lambda d: d.replace(options={**d.options, "noise": {**NOISE, "leak": 2e-4}}), "mean square over the region",
     ),
@@ -234,9 +220,9 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
     "other wanted": (
         lambda d: d.replace(options={**d.options, "wanted": {"leak": 0.5}}), "mean square over the region",
     ),
-    "too few rows out": (lambda d: _observer(d, forgetting=3), "rows without a claim"),
+    "too few rows out": (lambda d: with_observer(d, forgetting=3), "rows without a claim"),
     "another plant": (lambda d: d.replace(plant=tanks(constants={"eps": 0.02})), "fits the plant"),
-    "longer samples": (lambda d: _observer(d, dt=20.0), "mean square over the region"),
+    "longer samples": (lambda d: with_observer(d, dt=20.0), "mean square over the region"),
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.linalg import expm
+from tests.support.corruptions import with_claims, with_matrices
 
 import obsynth
 from obsynth import ObserverDesign, PolytopicSystem, PreconditionError, SpecError
@@ -135,16 +136,6 @@ def test_conditions_become_a_design() -> None:
         obsynth.conditions.sharepasand(sampled_plant(), poles=[0.1])
 
 
-def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
-
-
-def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
-
-
 def _nudged(design: ObserverDesign, name: str) -> ObserverDesign:
     matrix = np.array(getattr(design.observer, name))
     # In a row of a state that is integrated, and not read from an output.
@@ -153,25 +144,25 @@ def _nudged(design: ObserverDesign, name: str) -> ObserverDesign:
 
 
 _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] = {
-    "faster decay": (lambda d: _claims(d, region_decay=_stronger(d)), "decay over the region"),
-    "no decay": (lambda d: _claims(d, region_decay=float("nan")), "decay over the region"),
+    "faster decay": (lambda d: with_claims(d, region_decay=_stronger(d)), "decay over the region"),
+    "no decay": (lambda d: with_claims(d, region_decay=float("nan")), "decay over the region"),
     "smaller gain": (
-        lambda d: _claims(d, region_gain=0.9 * d.certificate.claims["region_gain"]), "gain over the region",
+        lambda d: with_claims(d, region_gain=0.9 * d.certificate.claims["region_gain"]), "gain over the region",
     ),
-    "no gain": (lambda d: _claims(d, region_gain=float("nan")), "gain over the region"),
-    "negative gain": (lambda d: _claims(d, region_gain=-1.0), "gain over the region"),
+    "no gain": (lambda d: with_claims(d, region_gain=float("nan")), "gain over the region"),
+    "negative gain": (lambda d: with_claims(d, region_gain=-1.0), "gain over the region"),
     "asymmetric P": (
-        lambda d: _matrices(d, P_region=d.certificate.matrices["P_region"] + 1e-9 * np.eye(4, k=1)),
+        lambda d: with_matrices(d, P_region=d.certificate.matrices["P_region"] + 1e-9 * np.eye(4, k=1)),
         "decay over the region",
     ),
-    "P of the gain that is flat": (lambda d: _matrices(d, P_gain=np.eye(4)[None]), "gain over the region"),
+    "P of the gain that is flat": (lambda d: with_matrices(d, P_gain=np.eye(4)[None]), "gain over the region"),
     "changed Az": (lambda d: _nudged(d, "Az"), "Sylvester"),
     "changed By": (lambda d: _nudged(d, "By"), "Sylvester"),
     "changed Bu": (lambda d: _nudged(d, "Bu"), "inputs"),
     "changed Cz": (lambda d: _nudged(d, "Cz"), "state"),
-    "other tracking": (lambda d: _matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]), "Sylvester"),
-    "tracking of other shape": (lambda d: _matrices(d, tracking=np.eye(3)), "fits the plant"),
-    "other fault model": (lambda d: _matrices(d, Phi=np.array([[1.01 if _discrete(d) else 0.01]])), "Sylvester"),
+    "other tracking": (lambda d: with_matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]), "Sylvester"),
+    "tracking of other shape": (lambda d: with_matrices(d, tracking=np.eye(3)), "fits the plant"),
+    "other fault model": (lambda d: with_matrices(d, Phi=np.array([[1.01 if _discrete(d) else 0.01]])), "Sylvester"),
     "too few rows out": (
         lambda d: d.replace(observer=replace(d.observer, forgetting=0)),  # type: ignore[type-var]
         "rows without a claim",

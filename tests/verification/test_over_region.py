@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from tests.support.corruptions import with_claims, with_matrices, with_observer
 from tests.support.polytopic_plants import WANG_A, WANG_BD, WANG_BF, WANG_LEAST, record, wang
 
 import obsynth
 from obsynth import ObserverDesign, PolytopicSystem, PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.design import Certificate
 
 
 @pytest.fixture(scope="module")
@@ -119,53 +118,40 @@ def test_a_rate_buys_a_smaller_gain() -> None:
     assert not obsynth.verify(faster.replace(observer=observer))["LMI"].passed
 
 
-def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
-
-
-def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
-
-
-def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    from dataclasses import replace
-
-    return design.replace(observer=replace(design.observer, **changed))
-
-
 def _nudged(design: ObserverDesign, name: str, size: float) -> ObserverDesign:
     matrix = np.array(getattr(design.observer, name))
     matrix[(1,) + (0,) * (matrix.ndim - 1)] += size
-    return _observer(design, **{name: matrix})
+    return with_observer(design, **{name: matrix})
 
 
 _P = "P_region"
 _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] = {
     "wider region": (lambda d: d.replace(plant=wang(0.06)), "unbiased: dynamics"),
-    "smaller number": (lambda d: _claims(d, gamma=0.9 * d.certificate.claims["gamma"]), "LMI"),
-    "no number": (lambda d: _claims(d, gamma=float("nan")), "LMI"),
+    "smaller number": (lambda d: with_claims(d, gamma=0.9 * d.certificate.claims["gamma"]), "LMI"),
+    "no number": (lambda d: with_claims(d, gamma=float("nan")), "LMI"),
     "faster decay": (
-        lambda d: _claims(d, region_decay=0.8 * d.certificate.claims["region_decay"]),
+        lambda d: with_claims(d, region_decay=0.8 * d.certificate.claims["region_decay"]),
         "decay over the region",
     ),
-    "growth": (lambda d: _claims(d, region_decay=1.0), "decay over the region"),
-    "asymmetric P": (lambda d: _matrices(d, P_region=d.certificate.matrices[_P] + np.eye(4, k=1) * 1e-9), "LMI"),
-    "negative P": (lambda d: _matrices(d, P_region=-d.certificate.matrices[_P]), "LMI"),
-    "P of other order": (lambda d: _matrices(d, P_region=np.eye(3)[None]), "LMI"),
-    "P that is flat": (lambda d: _matrices(d, P_region=np.eye(4)), "LMI"),
-    "a slack that is none": (lambda d: _matrices(d, G_region=np.eye(4)[None]), "LMI"),
+    "growth": (lambda d: with_claims(d, region_decay=1.0), "decay over the region"),
+    "asymmetric P": (lambda d: with_matrices(d, P_region=d.certificate.matrices[_P] + np.eye(4, k=1) * 1e-9), "LMI"),
+    "negative P": (lambda d: with_matrices(d, P_region=-d.certificate.matrices[_P]), "LMI"),
+    "P of other order": (lambda d: with_matrices(d, P_region=np.eye(3)[None]), "LMI"),
+    "P that is flat": (lambda d: with_matrices(d, P_region=np.eye(4)), "LMI"),
+    "a slack that is none": (lambda d: with_matrices(d, G_region=np.eye(4)[None]), "LMI"),
     "changed gain": (lambda d: _nudged(d, "Az", 1e-3), "unbiased: dynamics"),
     "changed By": (lambda d: _nudged(d, "By", 1e-3), "unbiased: dynamics"),
     "changed Bu": (lambda d: _nudged(d, "Bu", 1e-3), "unbiased: inputs"),
     "changed Cz": (lambda d: _nudged(d, "Cz", 1e-3), "unbiased: state"),
     "changed effectiveness": (lambda d: _nudged(d, "effectiveness", 1e-3), "fault estimate"),
-    "vertices in another order": (lambda d: _observer(d, Az=d.observer.Az[::-1]), "unbiased: dynamics"),  # type: ignore[union-attr]
-    "too few rows out": (lambda d: _observer(d, forgetting=3), "rows without a claim"),
-    "other tracking": (lambda d: _matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]), "unbiased: state"),
-    "tracking of other shape": (lambda d: _matrices(d, tracking=np.eye(3)), "fits the plant"),
-    "a claim without a row": (lambda d: _claims(d, gamma_bracket_low=1.0), "claims covered"),
+    "vertices in another order": (lambda d: with_observer(d, Az=d.observer.Az[::-1]), "unbiased: dynamics"),  # type: ignore[union-attr]
+    "too few rows out": (lambda d: with_observer(d, forgetting=3), "rows without a claim"),
+    "other tracking": (
+        lambda d: with_matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]),
+        "unbiased: state",
+    ),
+    "tracking of other shape": (lambda d: with_matrices(d, tracking=np.eye(3)), "fits the plant"),
+    "a claim without a row": (lambda d: with_claims(d, gamma_bracket_low=1.0), "claims covered"),
 }
 
 
@@ -182,7 +168,7 @@ def test_another_scheduling_of_the_observer_is_refused(design: ObserverDesign) -
 
     held = design.scheduled[1].scheduling
     for changed in (replace(held, high=1.1 * held.high), replace(held, names=("b", "a"), functions=("b", "a"))):
-        assert not obsynth.verify(_observer(design, scheduling=changed))["scheduling"].passed
+        assert not obsynth.verify(with_observer(design, scheduling=changed))["scheduling"].passed
 
 
 def test_an_effect_that_is_too_small_is_refused(scaled: ObserverDesign) -> None:

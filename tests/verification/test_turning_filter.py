@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from tests.conditions.test_turning_faults import turning_plant
 from tests.exporting.test_scheduled_c import _MAIN as MAIN
 from tests.exporting.test_scheduled_c import _compiled as compiled
 from tests.exporting.test_scheduled_c import _in_c as in_c
+from tests.support.corruptions import with_claims, with_matrices, with_observer
 
 import obsynth
 from obsynth import ObserverDesign, PolytopicSystem, PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.design import Certificate
 
 _BD = [[0.1], [0.2], [0.0], [0.3]]
 
@@ -74,24 +73,10 @@ def test_disturbances_pass_by_less_than_is_proved(design: ObserverDesign) -> Non
     assert 0.1 * gamma < design.report["worst switching found"].value <= gamma
 
 
-def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
-
-
-def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
-    known = design.certificate
-    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
-
-
-def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
-    return design.replace(observer=replace(design.scheduled[1], **changed))
-
-
 def _nudged(design: ObserverDesign, name: str, place: tuple[int, ...], size: float = 1e-3) -> ObserverDesign:
     matrix = np.array(getattr(design.observer, name))
     matrix[place] += size
-    return _observer(design, **{name: matrix})
+    return with_observer(design, **{name: matrix})
 
 
 def _moved_along_freedom(design: ObserverDesign) -> ObserverDesign:
@@ -103,7 +88,7 @@ def _moved_along_freedom(design: ObserverDesign) -> ObserverDesign:
                       np.hstack([0 * C @ TB[0], C @ TB[0], 2 * C @ TB[1]])])  # fmt: skip
     free = np.linalg.svd(rows)[0][:, 3:].sum(axis=1)
     correction += 5.0 * np.ones((4, 1)) * free.reshape(2, 1, 3)
-    return _observer(design, correction=correction)
+    return with_observer(design, correction=correction)
 
 
 _P = "P_region"
@@ -116,28 +101,28 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
         lambda d: d.replace(plant=_plant(C=[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]])),
         "unbiased: state",
     ),
-    "smaller number": (lambda d: _claims(d, gamma=0.9 * d.certificate.claims["gamma"]), "LMI"),
-    "no number": (lambda d: _claims(d, gamma=float("nan")), "LMI"),
-    "faster decay": (lambda d: _claims(d, region_decay=0.5 * d.certificate.claims["region_decay"]),
+    "smaller number": (lambda d: with_claims(d, gamma=0.9 * d.certificate.claims["gamma"]), "LMI"),
+    "no number": (lambda d: with_claims(d, gamma=float("nan")), "LMI"),
+    "faster decay": (lambda d: with_claims(d, region_decay=0.5 * d.certificate.claims["region_decay"]),
                      "decay over the region"),
-    "asymmetric P": (lambda d: _matrices(d, P_region=d.certificate.matrices[_P] + 1e-9 * np.eye(4, k=1)), "LMI"),
-    "flat P": (lambda d: _matrices(d, P_region=1e-6 * np.eye(4)[None]), "LMI"),
-    "a slack": (lambda d: _matrices(d, G_region=d.certificate.matrices[_P]), "LMI"),
+    "asymmetric P": (lambda d: with_matrices(d, P_region=d.certificate.matrices[_P] + 1e-9 * np.eye(4, k=1)), "LMI"),
+    "flat P": (lambda d: with_matrices(d, P_region=1e-6 * np.eye(4)[None]), "LMI"),
+    "a slack": (lambda d: with_matrices(d, G_region=d.certificate.matrices[_P]), "LMI"),
     "changed correction": (lambda d: _nudged(d, "correction", (1, 0, 0)), "fault decoupled for every scheduling"),
     "corrections in another order": (
-        lambda d: _observer(d, correction=np.array(d.scheduled[1].correction)[::-1]),
+        lambda d: with_observer(d, correction=np.array(d.scheduled[1].correction)[::-1]),
         "fault decoupled for every scheduling",
     ),
     "other corrections that decouple": (_moved_along_freedom, "LMI"),
-    "no correction": (lambda d: _observer(d, correction=None), "fits the plant"),
+    "no correction": (lambda d: with_observer(d, correction=None), "fits the plant"),
     "changed Az": (lambda d: _nudged(d, "Az", (1, 0, 0)), "unbiased: dynamics"),
     "changed fault row": (lambda d: _nudged(d, "Cz", (4, 0)), "unbiased: fault"),
     "changed residual row": (lambda d: _nudged(d, "Cz", (5, 0)), "unbiased: residual"),
     "changed Du": (lambda d: _nudged(d, "Du", (5, 0)), "unbiased: feedthrough"),
     "changed effectiveness": (lambda d: _nudged(d, "effectiveness", (1, 0, 0)), "fault estimate"),
-    "one row out less": (lambda d: _observer(d, forgetting=d.scheduled[1].forgetting - 1), "rows without a claim"),
+    "one row out less": (lambda d: with_observer(d, forgetting=d.scheduled[1].forgetting - 1), "rows without a claim"),
     "other tracking": (
-        lambda d: _matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]),
+        lambda d: with_matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]),
         "unbiased: dynamics",
     ),
 }  # fmt: skip
@@ -153,7 +138,7 @@ def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> Non
 
 def test_a_correction_of_another_shape_is_refused(design: ObserverDesign) -> None:
     with pytest.raises(SpecError, match="correction of the observer"):
-        _observer(design, correction=np.zeros((2, 4, 2)))
+        with_observer(design, correction=np.zeros((2, 4, 2)))
 
 
 def test_a_gain_set_and_arrays_hold_the_correction(tmp_path: Path, design: ObserverDesign) -> None:

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.quantities import numbers_in_units
 from obsynth.numerics.sparse import dense, is_sparse, same_matrix
 from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, exact_numbers
-from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, in_stated_units, plant_fields
+from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, plant_fields
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
 #: Larger plants as written are not stored with a design: their elimination is checked where it is done.
@@ -180,7 +181,9 @@ class DescriptorSystem:
             "disturbance_names": disturbance_names,
             "noise_names": noise_names,
         }
-        point, noise = in_stated_units(units, operating_point=operating_point, sensor_noise=sensor_noise)
+        stated = units if isinstance(units, Mapping) else {}
+        point = numbers_in_units(operating_point, stated, "operating_point")
+        noise = numbers_in_units(sensor_noise, stated, "sensor_noise", are_differences=True)
         values = plant_fields(
             asked,
             names,

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.quantities import numbers_in_units
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.checking import (
     COUNTED_BY,
@@ -255,12 +254,3 @@ def _noise_of_sensors(
             return ()
         given[name] = np.hstack([matrix, more])
     return tuple(f"noise {name}" for name in sensor_noise)
-
-
-def in_stated_units(units: Any, **given: Any) -> list[Any]:
-    """Return mappings from names of signals, with quantities in the units that are stated of these signals."""
-    stated = units if isinstance(units, Mapping) else {}
-    return [
-        numbers_in_units(mapping, stated, kind, are_differences=kind == "sensor_noise")
-        for kind, mapping in given.items()
-    ]

@@ -14,6 +14,7 @@ from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.numerics.quantities import in_seconds
 from obsynth.plants.dae_functions import BUTCHER
+from obsynth.plants.dead_times import SECONDS_IN_UNIT
 from obsynth.plants.signal_names import index_of
 
 #: Stands for a number that `obsynth.calibrate` is to find.
@@ -29,9 +30,6 @@ OFFSET_SIZE, OFFSET_WALK = 10.0, 1e-3
 
 #: How noise is called that a method assumes on each output where none is stated.
 ASSUMED = "assumed noise"
-
-#: Units of time in s.
-SECONDS_OF_UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def assumed_noise_names(outputs: Sequence[str]) -> list[str]:
@@ -111,9 +109,9 @@ def seconds(value: Any, path: str) -> float:
     """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
     text = re.sub(f"[{''.join(MICRO_SIGNS)}]s", "us", value) if isinstance(value, str) else ""
     match = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", text)
-    if match is not None and match[2] in SECONDS_OF_UNITS:
+    if match is not None and match[2] in SECONDS_IN_UNIT:
         try:
-            return stated_number(float(match[1]) * SECONDS_OF_UNITS[match[2]], path)
+            return stated_number(float(match[1]) * SECONDS_IN_UNIT[match[2]], path)
         except ValueError:
             pass
     return stated_number(in_seconds(value, path), path)
@@ -126,7 +124,7 @@ def stated_number(value: Any, path: str) -> float:
             f"{path} is unknown: find it from normal rows (obsynth calibrate --write-spec), or state a number.",
             path=path,
         )
-    return real_number(value, path, f"a number above 0 ({', '.join(SECONDS_OF_UNITS)} for times)", above=0.0)
+    return real_number(value, path, f"a number above 0 ({', '.join(SECONDS_IN_UNIT)} for times)", above=0.0)
 
 
 def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:

@@ -38,7 +38,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import duration, number
+from obsynth.results.layout import duration
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
@@ -50,6 +50,7 @@ from obsynth.studies.comparison import (
     delay_in_words,
     relative_error,
     rms,
+    short_delay,
 )
 from obsynth.studies.equal_delays import (
     HEALTHY_TIME,
@@ -484,7 +485,7 @@ def _equal_delay(
     values, decided = replay
     normal = normal_rows(log.truth, decided)
     centre, level = level_of_normal_rows(values, normal)
-    if log.truth[:, column].any():
+    if np.nan_to_num(log.truth[:, column]).any():
         return delay_on_log(np.where(decided, values, np.nan), log.times, log.truth[:, column], centre, level)
     return delay_of_scenario(values[normal], effects, fault, dt, centre, level)
 
@@ -512,7 +513,7 @@ def _reason(
     if best.equal_delay is not None:
         words.insert(0, delay_in_words(best.equal_delay, HEALTHY_TIME))
         if other_designs and other_designs[0].equal_delay is not None:
-            words[0] += f", against {number(other_designs[0].equal_delay[1])} s by {other_designs[0].method}"
+            words[0] += f", against {short_delay(other_designs[0].equal_delay)} by {other_designs[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
         words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")

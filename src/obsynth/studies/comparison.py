@@ -105,8 +105,8 @@ _FIGURE_MEANINGS = {
     ),
     "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
     EQUAL_DELAY: (
-        "seconds from a fault to its alarm with the level that 1 % of the normal rows of the log pass; never: no more "
-        "rows of the fault are in alarm than by chance"
+        f"seconds from a fault to its alarm with the level that {100 * HEALTHY_TIME:g} % of the normal rows of the log "
+        "pass; never: no more rows of the fault are in alarm than by chance"
     ),
     "gain / least": (
         "gain from all unknown inputs to all estimates, in times the least of any causal filter that responds to the "
@@ -262,6 +262,14 @@ def delay_in_words(delay: tuple[int, float], healthy_time: float) -> str:
     words = "no fault raises an alarm" if np.isinf(mean) else f"alarms after {number(mean)} s"
     words += f" with {100 * healthy_time:g} % of healthy time in alarm"
     return f"{words} ({missing} without one)" if missing and np.isfinite(mean) else words
+
+
+def short_delay(delay: tuple[int, float]) -> str:
+    """Return the same in two or three words, for a list."""
+    missing, mean = delay
+    if np.isinf(mean):
+        return "no alarm"
+    return f"{number(mean)} s" + (f" ({missing} without one)" if missing else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -596,7 +604,7 @@ def _statement_on_log(
     own = delays[best]
     words = "" if own is None else delay_in_words(own, HEALTHY_TIME)
     others = ", ".join(
-        f"{_delay_of_another(delay)} of {name}" for name, delay in delays.items() if name != best and delay is not None
+        f"{short_delay(delay)} of {name}" for name, delay in delays.items() if name != best and delay is not None
     )
     fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
     where = "" if log is None else f", on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
@@ -606,13 +614,6 @@ def _statement_on_log(
         f"and the mean delay of the others: {words}{f', against {others}' if others else ''}"
         f"{fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
     )
-
-
-def _delay_of_another(delay: tuple[int, float]) -> str:
-    missing, mean = delay
-    if np.isinf(mean):
-        return "no alarm"
-    return f"{number(mean)} s" + (f" ({missing} without one)" if missing else "")
 
 
 def _reach(values: FloatArray) -> float:

@@ -216,7 +216,7 @@ def _in_order(
     if directions is None:
         return
     Bf0, Delta = directions
-    reach = inverse_bound(Delta)
+    reach, _ = inverse_bound(Delta)
     yield effectiveness_condition(
         reach,
         "Delta(mu) of Bf(mu) = Bf0 Delta(mu) is nonsingular on the whole region: a fault does not lose its effect",

@@ -111,7 +111,7 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     mean = sum((C @ each / np.linalg.norm(C @ each, axis=0) for each in driven), np.zeros((plant.ny, plant.nf)))
     W = np.asarray(np.linalg.pinv(mean))
     Delta = tuple(W @ C @ each for each in driven)
-    reach = inverse_bound(Delta)
+    reach, _ = inverse_bound(Delta)
     yield effectiveness_condition(
         reach, "W C T Bf(mu) is nonsingular on the whole region: a fault stays apart from its opposite", _SOURCE
     )

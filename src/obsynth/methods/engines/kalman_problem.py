@@ -91,14 +91,15 @@ class KalmanProblem:
     def quietest_gain(self, decay: float) -> FloatArray | None:
         """Return the gain of the least prescribed rate whose poles all decay at ``decay`` (1/s) or faster; ``None``
         when the equation has none.  Poles of a rate lie well beyond it, which costs noise."""
-        best, change = self.solved(decay, np.eye(self.F.shape[0]))
+        start = np.eye(self.F.shape[0])
+        best, change = self.solved(decay, start)
         if best is None or not best.size or decay == 0.0:
             return best
         wanted, low, high = WELL_REACHED * decay, 0.0, decay
         noise = self.deviations(best, change)
         for _ in range(RATE_BISECTIONS):
             middle = 0.5 * (low + high) if low > 0.0 else FIRST_SHARE * high
-            gain, change = self.solved(middle, np.eye(self.F.shape[0]))
+            gain, change = self.solved(middle, start)
             reached = 0.0 if gain is None else float(np.min(decay_rates(eigenvalues(self.F - gain @ self.C), self.dt)))
             if gain is None or reached < wanted:
                 low = middle

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from obsynth.analysis.existence.over_region import conditions_over_region
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.identities_over_region import IDENTITIES, effectiveness_row
+from obsynth.methods.fault_estimation_filter.identities_over_region import (
+    IDENTITIES,
+    effectiveness_row,
+    gain_rows,
+    have_matching_signals,
+)
 from obsynth.methods.fault_estimation_filter.turning_checks import turning_checks
 from obsynth.methods.fault_estimation_filter.whole_transfer import fault_rows
 from obsynth.numerics.arrays import FloatArray
@@ -19,7 +22,7 @@ from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.proofs.vertex_inequalities import pairs_of
-from obsynth.results.checks import Check, fitting_check, information
+from obsynth.results.checks import Check, fitting_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.error_system import ErrorModel
@@ -30,17 +33,12 @@ from obsynth.verification.over_region import (
     decay_row,
     fault_error_vertices,
     forgetting_row,
-    gain_row,
     same_scheduling_row,
-    switching_row,
     tracking_rows,
     witness_of_certificate,
     worst_of_vertices,
 )
 from obsynth.verification.plant import condition_rows
-
-#: What a product of three numbers and a quotient may be rounded by.
-_ROOM = 4.0 * float(np.finfo(np.float64).eps)
 
 
 def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
@@ -55,7 +53,11 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
         yield from turning_checks(design, plant, observer)
         return
     tracking = design.certificate.matrices.get("tracking")
-    fits = tracking is not None and _fits(plant, observer, tracking)
+    fits = (
+        tracking is not None
+        and have_matching_signals(plant, observer, tracking)
+        and observer.residual_names == plant.fault_names
+    )
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
     if tracking is None or not fits:
         return
@@ -68,20 +70,6 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, observers, tracking, models)
     yield from _proved_rows(design, plant, observer, tracking)
-
-
-def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
-    return (
-        observer.count == plant.count
-        and observer.dt == plant.dt
-        and observer.input_names[: observer.inputs] == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == observer.residual_names == plant.fault_names
-        and observer.state_delays == (0,) * plant.nx
-        and observer.fault_delays == (1,) * plant.nf
-        and tracking.shape == (observer.order, plant.nx)
-    )
 
 
 def _fault_rows(
@@ -128,22 +116,10 @@ def _proved_rows(
     vertices = fault_error_vertices(plant.vertices, undivided, tracking)
     reach = 1.0
     if not observer.effectiveness_is_one:
-        row, reach = effectiveness_row(plant, observer)
+        row, reach = effectiveness_row(observer)
         yield row
     if plant.nd:
-        gamma = claimed(claims, "gamma")
-        level = gamma / reach * (1.0 - _ROOM)
-        yield gain_row(vertices, witness, level, gamma, discrete=True, words=words)
-        if steps is None:
-            yield switching_row(vertices, level)
-        if "gamma_min" in claims:
-            yield information(
-                "least gain",
-                "the least gain that the inequalities at the vertices allow, as the solver found it",
-                claimed(claims, "gamma_min"),
-                source="certificate",
-                status="assumed",
-            )
+        yield from gain_rows(design, vertices, witness, reach, words, switched=[] if steps is not None else vertices)
     decay = claimed(claims, "region_decay")
     yield decay_row(vertices, witness, decay, discrete=True, words=words)
     yield forgetting_row(decay, observer.forgetting, discrete=True)

@@ -1,14 +1,20 @@
-"""Rows that every fault-estimation filter over a region has: what makes it unbiased, and the effect of the faults."""
+"""Rows that every fault-estimation filter over a region has: unbiased, the effect of the faults, the claimed gain."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
-from obsynth.analysis.existence.effectiveness import EFFECTIVENESS_SHARES
+from obsynth.analysis.existence.effectiveness import inverse_bound
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.proofs.vertex_inequalities import VertexProof, prove_nonsingular
-from obsynth.results.checks import Check, upper_bound_check
+from obsynth.proofs.vertex_inequalities import Vertex, Witness
+from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.claims import claimed
+from obsynth.verification.over_region import gain_row, switching_row
 
 #: Names, claims and sources of the rows on what makes a filter unbiased.
 IDENTITIES = {
@@ -21,28 +27,63 @@ IDENTITIES = {
 }
 #: The row that says what an effectiveness that changes does to the gain.
 EFFECTIVENESS_ROW = "effectiveness of the faults"
+#: What a product of three numbers and a quotient may be rounded by.
+_ROOM = 4.0 * float(np.finfo(np.float64).eps)
 
 
-def effectiveness_row(plant: PolytopicSystem, observer: ScheduledObserver) -> tuple[Check, float]:
+def have_matching_signals(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
+    """Whether an observer and a tracking map are for the signals of a plant, by names and shapes."""
+    return (
+        observer.count == plant.count
+        and observer.dt == plant.dt
+        and observer.input_names[: observer.inputs] == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == plant.state_names
+        and observer.fault_names == plant.fault_names
+        and observer.state_delays == (0,) * plant.nx
+        and observer.fault_delays == (1,) * plant.nf
+        and tracking.shape == (observer.order, plant.nx)
+    )
+
+
+def effectiveness_row(observer: ScheduledObserver) -> tuple[Check, float]:
     """Return the row that the effectiveness is nonsingular over the region, and a bound on its inverse."""
-    each = list(observer.effectiveness)
-    least = min(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0]) for matrix in each)
-    room, proof = 0.0, VertexProof(False, -np.inf, 0, "it is singular at a vertex, or next to it")
-    for share in EFFECTIVENESS_SHARES:
-        room = share * least
-        if room <= 0.0:
-            break
-        proof = prove_nonsingular(each, np.eye(plant.nf), room)
-        if proof.proved:
-            break
-    reach = float(np.nextafter(1.0 / room, np.inf)) if proof.proved else np.inf
+    reach, reason = inverse_bound(list(observer.effectiveness))
+    bound = np.inf if reach is None else reach
     row = upper_bound_check(
         EFFECTIVENESS_ROW,
         "the effect of the faults does not vanish over the region: the norm of its inverse is at most this",
-        reach,
-        reach if proof.proved else -np.inf,
+        bound,
+        -np.inf if reach is None else reach,
         source="Delta + Delta' definite at every vertex, proved in balls",
         kind="proved",
-        detail="" if proof.proved else f"not proved: {proof.reason}",
+        detail=f"not proved: {reason}" if reach is None else "",
     )
-    return row, reach
+    return row, bound
+
+
+def gain_rows(
+    design: ObserverDesign,
+    vertices: Sequence[Vertex],
+    witness: Witness | None,
+    reach: float,
+    words: str,
+    *,
+    switched: Sequence[Vertex],
+) -> Iterator[Check]:
+    """Yield the rows on the claimed gain from the disturbances, the errors of which are divided by an effectiveness
+    whose inverse is at most ``reach``; ``switched``: the vertices between which worst courses are searched."""
+    claims = design.certificate.claims
+    gamma = claimed(claims, "gamma")
+    level = gamma / reach * (1.0 - _ROOM)
+    yield gain_row(vertices, witness, level, gamma, discrete=True, words=words)
+    if switched:
+        yield switching_row(switched, level)
+    if "gamma_min" in claims:
+        yield information(
+            "least gain",
+            "the least gain that the inequalities at the vertices allow, as the solver found it",
+            claimed(claims, "gamma_min"),
+            source="certificate",
+            status="assumed",
+        )

@@ -13,13 +13,18 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.existence.turning_filter import has_turning_form, pairs_of_vertices
-from obsynth.methods.fault_estimation_filter.identities_over_region import IDENTITIES, effectiveness_row
+from obsynth.methods.fault_estimation_filter.identities_over_region import (
+    IDENTITIES,
+    effectiveness_row,
+    gain_rows,
+    have_matching_signals,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.proofs.extended_balls import Enclosed
 from obsynth.proofs.vertex_inequalities import Vertex
-from obsynth.results.checks import Check, fitting_check, information
+from obsynth.results.checks import Check, fitting_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.error_system import ErrorModel
@@ -29,16 +34,12 @@ from obsynth.verification.over_region import (
     courses,
     decay_row,
     forgetting_row,
-    gain_row,
     same_scheduling_row,
-    switching_row,
     tracking_rows,
     witness_of_certificate,
 )
 
 _SOURCE = "a correction that turns with the faults"
-#: What a product of three numbers and a quotient may be rounded by.
-_ROOM = 4.0 * float(np.finfo(np.float64).eps)
 
 
 def turning_checks(design: ObserverDesign, plant: PolytopicSystem, observer: ScheduledObserver) -> Iterator[Check]:
@@ -62,16 +63,9 @@ def turning_checks(design: ObserverDesign, plant: PolytopicSystem, observer: Sch
 def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
     return (
         has_turning_form(plant)
-        and observer.count == plant.count
+        and have_matching_signals(plant, observer, tracking)
         and observer.order == plant.nx
-        and observer.dt == plant.dt
-        and observer.input_names[: observer.inputs] == plant.input_names
-        and observer.output_names == observer.residual_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
-        and observer.state_delays == (0,) * plant.nx
-        and observer.fault_delays == (1,) * plant.nf
-        and tracking.shape == (observer.order, plant.nx)
+        and observer.residual_names == plant.output_names
         # The corrected state is the corrected z, whole.
         and np.array_equal(observer.Cz[observer.state_rows], np.eye(plant.nx))
     )
@@ -110,21 +104,10 @@ def _proved_rows(
     # A P for every course alone: pairs of vertices are no vertices between which a rate would be one.
     witness = None if "G_region" in matrices else witness_of_certificate(matrices, None)
     vertices = pair_vertices(plant, observer, tracking, K)
-    row, reach = effectiveness_row(plant, observer)
+    row, reach = effectiveness_row(observer)
     yield row
     if plant.nd:
-        gamma = claimed(claims, "gamma")
-        level = gamma / reach * (1.0 - _ROOM)
-        yield gain_row(vertices, witness, level, gamma, discrete=True, words=words)
-        yield switching_row([vertices[0], vertices[-1]], level)
-        if "gamma_min" in claims:
-            yield information(
-                "least gain",
-                "the least gain that the inequalities at the vertices allow, as the solver found it",
-                claimed(claims, "gamma_min"),
-                source="certificate",
-                status="assumed",
-            )
+        yield from gain_rows(design, vertices, witness, reach, words, switched=[vertices[0], vertices[-1]])
     decay = claimed(claims, "region_decay")
     yield decay_row(vertices, witness, decay, discrete=True, words=words)
     # A fault estimate has the error of the sample before.

@@ -121,13 +121,13 @@ def _telling_rows(unknowns: FloatArray, known: FloatArray) -> FloatArray:
     """Return combinations ``(q, p)`` of equations in ``unknowns (p, states and noise)`` and signals that are ``known
     (p, columns)``, without those in which no unknown appears: empty ones, and outputs that read nothing."""
     p = len(unknowns)
-    if not p or not unknowns.size:
-        return np.eye(p)[:0] if p else np.eye(0)
+    if not unknowns.size:
+        return np.zeros((0, p))
     scaled, signals = (part / np.maximum(np.max(np.abs(part), axis=0), SMALLEST) for part in (unknowns, known))
     lengths = np.linalg.norm(scaled, axis=1)
     telling = np.flatnonzero(lengths > RANK_TOLERANCE * np.linalg.norm(signals, axis=1))
     if not len(telling):
-        return np.eye(p)[:0]
+        return np.zeros((0, p))
     # At length one: an equation in which the unknowns are small says as much as any.
     basis, values, _ = np.linalg.svd(scaled[telling] / lengths[telling, None])
     rank = rank_from(values, expected=len(telling)).rank
