@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 import obsynth
-from obsynth.cli.main import design_command, main
+from obsynth.cli.main import design_command, main, obsynth_parser
 from obsynth.results.gain_set_writing import digest_of
 from obsynth.results.gain_sets import load
 
@@ -293,6 +294,17 @@ class TestEndings:
         printed = capsys.readouterr()
         assert printed.out == ""
         assert "usage:" in printed.err
+
+    def test_the_first_steps_name_commands_that_parse_and_files_that_exist(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with pytest.raises(SystemExit):
+            main([])
+        lines = [shlex.split(line) for line in capsys.readouterr().err.splitlines() if line.startswith("  obsynth ")]
+        assert [words[1] for words in lines] == ["check", "design", "simulate"]
+        for words in lines:
+            options = obsynth_parser().parse_args(words[1:])
+            assert (ROOT / options.system).is_file()
 
     @pytest.mark.parametrize(
         ("command", "arguments", "told"),

@@ -36,6 +36,28 @@ from obsynth.report.terminal.output import print_error, print_json
 from obsynth.report.terminal.verbs import Verb
 from obsynth.version import __version__
 
+#: What the program prints when it is called without arguments.
+FIRST_STEPS = f"""\
+usage: obsynth COMMAND [options]
+
+obsynth {__version__} designs observers and fault-estimation filters for descriptor and
+ordinary systems by linear matrix inequalities and convex optimisation, and
+verifies every result without the solver.
+
+Three commands to begin with, in the folder of obsynth:
+
+  obsynth check --system designs/wang2015/spec.yaml
+      which methods have a solution for this plant, and if one has none, why
+  obsynth design --system designs/wang2015/spec.yaml
+      a filter with proved bounds, written to wang2015.gains.json
+  obsynth simulate --system designs/wang2015/spec.yaml --out run.csv
+      the faults and their estimates on the scenario of the spec
+
+For your own plant, change a copy of spec.yaml: docs/start.md explains it line
+by line. "obsynth --help" lists all commands, "obsynth COMMAND --help" explains
+one.
+"""
+
 EXIT_CODES = """\
 exit codes:
   0  success
@@ -47,12 +69,10 @@ exit codes:
 """
 
 #: Verbs whose help lists the methods that are installed.
-_TELL_METHODS = ("design", "check", "compare")
+_VERBS_WITH_METHODS = ("design", "check", "compare")
 
-
-#: Exit code of a program whose reader has left, as shells give it.
+#: Exit code of a program whose reader has closed the pipe, by the convention of shells.
 BROKEN_PIPE = 141
-
 
 #: New objects after which Python looks for cycles of garbage, of a few MB: with its own number, a tenth of a short
 #: command was looking through what imports have made.
@@ -84,6 +104,7 @@ VERBS = _all_verbs()
 def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentParser:
     """Return the parser of ``obsynth`` with all its verbs; only those among ``words`` have arguments."""
     parser = _parser("obsynth", "Design, verify and run observers and fault-estimation filters for descriptor systems.")
+    parser.first_steps = FIRST_STEPS
     parser.add_argument(
         "--print-completion",
         action=PrintCompletion,
@@ -105,7 +126,7 @@ def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentPar
     return parser
 
 
-def _parser(name: str, description: str) -> argparse.ArgumentParser:
+def _parser(name: str, description: str) -> Parser:
     parser = Parser(
         prog=name,
         description=fill(description, width=78),
@@ -124,7 +145,7 @@ def _with_verb(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentP
     add_arguments(parser, VERBS[name].arguments)
     if settings := settings_of(VERBS[name].arguments):
         add_settings(parser, settings)
-    if name in _TELL_METHODS:
+    if name in _VERBS_WITH_METHODS:
         # Asked for only when the help is printed: other packages may have registered some.
         parser.format_help = lambda: _help_with_methods(parser)  # type: ignore[method-assign]
     return parser

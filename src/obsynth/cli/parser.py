@@ -9,6 +9,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
+from obsynth.errors import SpecError
+
 #: How alike a word must be to what may be meant, as `difflib` measures it.
 ALIKE = 0.6
 #: How many words are suggested.
@@ -21,15 +23,19 @@ SHELLS = ("bash", "zsh", "tcsh")
 class Parser(argparse.ArgumentParser):
     """An argument parser that names the command or option that a misspelt one may mean."""
 
+    #: Printed where the program is called without any argument; empty: the usage, as by `argparse`.
+    first_steps: str = ""
     _words: Sequence[str] = ()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as `argparse` does, and keep the words for what is said about them."""
+        """Parse as `argparse` does, and store the words, which the messages of refusals name."""
         self._words = list(args) if args is not None else []
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """End the program with its usage, the message, and what may be meant."""
+        if self.first_steps and not self._words:
+            self.exit(SpecError.exit_code, self.first_steps)
         choice = re.match(r"argument (\S+): invalid choice: '([^']*)'", message)
         if choice is not None and choice.group(1) == "COMMAND":
             commands = next(item.choices for item in self._actions if isinstance(item, argparse._SubParsersAction))

@@ -141,9 +141,9 @@ VERBS = {
     ),
     "export": Verb(
         _run_export,
-        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), as a functional mock-up unit for "
-        "co-simulation (.fmu), or the proof of its claims in whole numbers (.json). A recursive design "
-        "for a time-invariant plant is written as its steady state.",
+        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h) or co-simulation (.fmu), or the proof "
+        "of its claims in integers (.json). A recursive design for a time-invariant plant is written as its steady "
+        "state.",
         (
             GAINS,
             UNVERIFIED,
