@@ -227,6 +227,12 @@ def test_plants_are_drawn_from_the_box() -> None:
         obsynth.evaluate(exact, quiet, runs=2, plants=2)
     with pytest.raises(SpecError, match="follows inputs and outputs"):
         adaptive.watch(obsynth.simulate(design, quiet).estimates)
+    # No table is that of the adaptive rule; the exact model's, which lacks tolerances and the start, has its own name.
+    with pytest.raises(SpecError, match="follows inputs and outputs"):
+        _ = adaptive.threshold
+    assert (adaptive.nominal_threshold <= fixed.threshold).all()
+    assert adaptive.nominal_threshold[-1] == pytest.approx(fixed.threshold[-1], rel=1e-9)
+    np.testing.assert_array_equal(fixed.nominal_threshold, fixed.threshold)
 
 
 @pytest.mark.one_in(4)

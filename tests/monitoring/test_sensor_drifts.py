@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -74,7 +75,6 @@ def test_a_drift_that_is_allowed_for_is_no_alarm_and_larger_faults_are() -> None
 def test_the_steady_state_of_a_linear_observer_is_what_runs_settle_at() -> None:
     design, offsets = linear_design(), np.array([0.3, 0.7])
     found = linear_drifts(design.observer, offsets)
-    assert found is not None
     data, columns = linear_log(3, rows=200), ["y1", "y2"]
     rows = {}
     for i in range(3):
@@ -103,6 +103,44 @@ def test_levels_with_a_drift_are_the_same_in_all_units_of_a_log() -> None:
     again = learn_thresholds(design, scaled, false_alarms="1 per 500 rows", sensor_drift=1.0, scales={"y1": 1e-3})
     np.testing.assert_allclose(again.levels, expected.levels, rtol=1e-6)
     np.testing.assert_allclose(again.statistics.bands, expected.statistics.bands, rtol=1e-9)
+
+
+def with_held(data: pd.DataFrame, *names: str) -> pd.DataFrame:
+    """Return a log in which sensors hold each value for ten rows: most of their third differences vanish."""
+    return data.assign(**{name: data[name].iloc[::10].repeat(10).to_numpy() for name in names})
+
+
+def test_sensors_whose_noise_nobody_knows_get_no_room() -> None:
+    data = with_held(linear_log(8, rows=300), "y2")[["y1", "y2"]].to_numpy()
+    design = filter_without_noise()
+    drifts = linear_drifts(design.observer, sensor_deviations(design, data))
+    assert drifts.sensors_without().tolist() == [False, True]
+    # So does one whose offset leaves no row known.
+    watched = drifts.watched.copy()
+    watched[0] = np.nan
+    assert drifts._replace(watched=watched).sensors_without().tolist() == [True, True]
+
+
+def test_a_drift_is_refused_where_no_sensor_has_noise() -> None:
+    design, data = filter_without_noise(), with_held(linear_log(8, rows=300), "y1", "y2")
+    with pytest.raises(obsynth.SpecError, match="No noise of any sensor") as refused:
+        learn_thresholds(design, data, false_alarms="1 per 50 rows", sensor_drift=1.0)
+    assert refused.value.path == "sensor_drift"
+
+
+@pytest.mark.long
+def test_the_statement_names_sensors_without_room(tmp_path: Path) -> None:
+    design, data = filter_without_noise(), with_held(linear_log(8, rows=300), "y2")
+    found = learn_thresholds(design, data, false_alarms="1 per 50 rows", sensor_drift=1.0)
+    assert found.without_drift == ("y2",)
+    assert "drift of each sensor but y2 by one deviation" in found.statement
+    assert obsynth.load_thresholds(found.save(tmp_path / "t.json")).without_drift == ("y2",)
+
+
+def test_a_drift_is_refused_where_the_observer_integrates() -> None:
+    observer = dataclasses.replace(linear_design().observer, Az=np.eye(linear_design().observer.order))
+    with pytest.raises(obsynth.SpecError, match="never settles"):
+        linear_drifts(observer, np.array(NOISE))
 
 
 def test_runs_give_what_offsets_do_and_their_own_centre() -> None:

@@ -317,7 +317,8 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
         passed = watched.passed_in(replace(without, **moved))
         return bool((passed & ~false).any(axis=0).all())
 
-    level = np.abs(watched.threshold[np.isfinite(watched.threshold)])
+    exact = watched.nominal_threshold
+    level = np.abs(exact[np.isfinite(exact)])
     high = float(np.max(level, initial=np.finfo(np.float64).tiny))
     low, most = 0.0, MOST_TIMES * high
     while not alarms_at(high):

@@ -110,6 +110,8 @@ class LearnedThresholds:
         The share of healthy rows in alarm, with its interval, on rows that were not learned from.
     sensor_drift : float
         Deviations of its noise by which each sensor may drift slowly without an alarm; zero: none is allowed for.
+    without_drift : tuple of str
+        Sensors for which none is allowed for all the same, as nothing is known of their noise or of what a drift does.
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
@@ -139,6 +141,7 @@ class LearnedThresholds:
     healthy_time: HealthyTime = NO_HEALTHY_TIME
     repeats: FloatArray | None = None
     sensor_drift: float = 0.0
+    without_drift: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -172,9 +175,15 @@ class LearnedThresholds:
             + (f"between {self.logs} logs)" if self.logs > 1 else "between parts of one log)")
         )
         if self.sensor_drift:
+            unknown = ", ".join(self.without_drift)
             text += (
-                f"; a slow drift of each sensor by {_counted_number(self.sensor_drift, 'deviation')} of its noise is "
-                "allowed for"
+                f"; a slow drift of each sensor{f' but {unknown}' if unknown else ''} by "
+                f"{_counted_number(self.sensor_drift, 'deviation')} of its noise is allowed for"
+                + (
+                    f" (for {unknown} no noise is stated and the log shows none, or nothing is known with such a drift)"
+                    if unknown
+                    else ""
+                )
             )
         if self.lasting:
             text += (
@@ -245,6 +254,7 @@ class LearnedThresholds:
             "healthy_time": list(self.healthy_time),
             "repeats": self.repeats,
             "sensor_drift": self.sensor_drift,
+            "without_drift": list(self.without_drift),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -380,4 +390,5 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         HealthyTime(*map(float, data["healthy_time"])),
         None if data.get("repeats") is None else read_only(np.asarray(data["repeats"], dtype=np.float64)),
         real_number(data.get("sensor_drift", 0.0), "sensor_drift", "deviations, 0 or more", least=0.0),
+        tuple(map(str, data.get("without_drift", ()))),
     )

@@ -118,7 +118,8 @@ def learn_thresholds(
         refused, as its levels would be those of the wrong unit.
     sensor_drift : float, optional
         Deviations of its noise by which each sensor may drift slowly without an alarm, whether the logs show that or
-        not; 0: none.  The noise is the one that the design states, or else that of the log.
+        not; 0: none.  The noise is the one that the design states, or else that of the log; the statement names sensors
+        for which there is neither, and which get no room.
 
     Returns
     -------
@@ -131,7 +132,7 @@ def learn_thresholds(
     ------
     SpecError
         The log cannot be read, holds too few rows, or nothing moves in it; the rate is none; a signal is likely in
-        another unit than the plant's.
+        another unit than the plant's; a ``sensor_drift`` where no sensor has noise, or the design integrates.
 
     References
     ----------
@@ -186,10 +187,11 @@ def learn_thresholds(
     wanted = [(a + first, a + last) for a, b in logs.ends for first, last in [parsed_rows(rows, b - a)]]
     output = output.of_rows(wanted)
     dt = _sample_time(design, output)
+    drifts = _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift)
     options: dict[str, Any] = {
         "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs,
         "logs": logs.slices_of(output.numbers), "repeats": logs.repeats,
-        "drifts": _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift), "sensor_drift": sensor_drift,
+        "drifts": drifts, "sensor_drift": sensor_drift,
     }  # fmt: skip
     learned = thresholds_from_rows(
         design,
@@ -207,7 +209,12 @@ def learn_thresholds(
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     inputs = logs.rows[output.numbers, 1 : 1 + signals.inputs]
     divided = divided_at_starts(design.observer, output.scores if learned.statistics.estimates else None)
-    return replace(learned, notes=(*notes, *notes_of_sizes(white, inputs), *notes_of_starts(divided)))
+    without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
+    return replace(
+        learned,
+        notes=(*notes, *notes_of_sizes(white, inputs), *notes_of_starts(divided)),
+        without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,11 +259,17 @@ def _drifts(
     design: ObserverDesign, started: Callable[[], LogRun], logs: _NormalLogs, sensor_drift: float
 ) -> SensorDrifts | None:
     """Return what drifts of so many deviations of each sensor do to the rows that a design makes of normal logs; `None`
-    where none is allowed for, or nothing is known of them."""
+    where none is allowed for."""
     if not sensor_drift:
         return None
     signals, ny = started().signals, len(logs.repeats)
     offsets = sensor_drift * sensor_deviations(design, signals.deviations(logs.rows)[:, -ny:])
+    if not offsets.any():
+        raise SpecError(
+            "No noise of any sensor is stated, and the log shows none: a drift in deviations of it is nothing. State "
+            "the noise (sensor_noise), or leave sensor_drift at 0.",
+            path="sensor_drift",
+        )
     if isinstance(design.observer, LinearObserver):
         return linear_drifts(design.observer, offsets)
     first, last = max(logs.ends, key=lambda ends: ends[1] - ends[0])

@@ -235,7 +235,27 @@ class Monitor:
 
     @property
     def threshold(self) -> FloatArray:
-        """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet."""
+        """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet.
+
+        Raises
+        ------
+        SpecError
+            The threshold is computed row by row: for data of any length, or as it follows inputs and outputs (of those,
+            `nominal_threshold` is the part that does not).
+        """
+        if self.rule.adapts and self.horizon is not None:
+            raise SpecError(
+                "An adaptive threshold follows inputs and outputs, and no table holds it: use obsynth.evaluate, or "
+                "obsynth.online_monitor with obsynth.run_on_data, whose table holds it; nominal_threshold is what "
+                "it adds to.",
+                path="monitor",
+            )
+        return self.nominal_threshold
+
+    @property
+    def nominal_threshold(self) -> FloatArray:
+        """Thresholds ``(horizon,)`` of a record for the exact model: `threshold` itself; or, of an adaptive rule, what
+        tolerances and the start add to, which alone is no bound."""
         if self.horizon is None or self.rule.table is None:
             raise SpecError(
                 "This monitor is for data of any length: its threshold is computed by `step`.", path="monitor"
@@ -353,10 +373,9 @@ class Monitor:
         SpecError
             Another number of samples than the monitor was made for.
         """
-        if len(residuals) != len(self.threshold):
-            raise SpecError(
-                f"The record has {len(residuals)} samples, but the monitor is for {len(self.threshold)}.", path="steps"
-            )
+        steps = len(self.nominal_threshold)
+        if len(residuals) != steps:
+            raise SpecError(f"The record has {len(residuals)} samples, but the monitor is for {steps}.", path="steps")
         return self.rule.statistics(residuals)
 
     def passed_in(self, runs: Runs, *, onset: int | None = None) -> NDArray[np.bool_]:
@@ -373,7 +392,7 @@ class Monitor:
         observer: Any = runs.observer
         rows = observer.fault_rows if self.watches_estimates else observer.residual_rows
         norm = self.statistic(runs.rows[:, :, rows])
-        return self.rule.passed_in(runs, norm, self.threshold + self.floor, onset)
+        return self.rule.passed_in(runs, norm, self.nominal_threshold + self.floor, onset)
 
     def isolated(self, faults: FloatArray, k: int) -> int:
         """Return the number of the fault that an alarm points to, at ``k``; with `groups` it is proved.

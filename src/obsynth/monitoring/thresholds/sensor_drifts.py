@@ -13,7 +13,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import Scores
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -34,12 +36,20 @@ MEDIAN_DEVIATIONS, THIRD_DIFFERENCES = 1.4826, 20.0
 
 
 class SensorDrifts(NamedTuple):
-    """What offsets of each sensor do, once they have settled: differences to the rows without them."""
+    """What offsets of each sensor do, once they have settled: differences to the rows without them; of some sensors
+    nothing is known."""
 
     watched: FloatArray  # ``(ny, n, m)``: of fault estimates and residuals; NaN where nothing is known
     away: FloatArray  # ``(ny, n, nf)``: of scores of changes of the faults; no rows where there are no scores
     information: FloatArray  # ``(ny, n, nf)``: how much these rows say of each fault alone
     theta: FloatArray  # ``(ny, n, nf)``: of the faults' estimates beside the scores
+    offsets: FloatArray  # ``(ny,)``: zero where no noise of a sensor is known
+
+    def sensors_without(self) -> NDArray[np.bool_]:
+        """Return the sensors for which there is no room ``(ny,)``: those without noise, and those whose offset leaves
+        no row known."""
+        known = np.isfinite(self.watched).any(axis=(1, 2))
+        return np.asarray((self.offsets == 0.0) | ~known)
 
     def white_means(self, statistics: Statistics, columns: list[int]) -> FloatArray:
         """Return means of the effects on whitened rows, over as many rows as statistics look back: ``(ny, k, m)``."""
@@ -93,29 +103,38 @@ def sensor_deviations(design: ObserverDesign, outputs: FloatArray) -> FloatArray
         own = dict(zip(plant.output_names, np.linalg.norm(np.atleast_2d(plant.dense().Dw), axis=1), strict=True))
         names = getattr(observer, "output_names", plant.output_names)
         stated = np.array([own.get(name, 0.0) for name in names])
-    learned = np.zeros_like(stated)
-    for i, column in enumerate(outputs.T):
-        third = np.diff(column, n=3)
-        third = third[np.isfinite(third)]
-        if third.size:
-            learned[i] = MEDIAN_DEVIATIONS * float(np.median(np.abs(third))) / np.sqrt(THIRD_DIFFERENCES)
+    learned = np.array([_third_difference_deviation(column) for column in outputs.T])
     return np.asarray(np.where(stated > 0.0, stated, learned))
 
 
-def linear_drifts(observer: LinearObserver, offsets: FloatArray) -> SensorDrifts | None:
-    """Return what offsets ``(ny,)`` of each sensor do to a linear observer in the steady state; `None` where it has
+def _third_difference_deviation(column: FloatArray) -> float:
+    """Return the deviation of noise in samples ``(n,)`` by their third differences; zero where most of these vanish, as
+    those of a coarse, slow or stuck sensor."""
+    third = np.diff(column, n=3)
+    third = third[np.isfinite(third)]
+    if not third.size:
+        return 0.0
+    return MEDIAN_DEVIATIONS * float(np.median(np.abs(third))) / float(np.sqrt(THIRD_DIFFERENCES))
+
+
+def linear_drifts(observer: LinearObserver, offsets: FloatArray) -> SensorDrifts:
+    """Return what offsets ``(ny,)`` of each sensor do to a linear observer in the steady state; refuse one that has
     none."""
     held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
     try:
         gains = observer.Dy + observer.Cz @ np.linalg.solve(held, observer.By)
+        rows = np.concatenate([gains[observer.fault_rows], gains[observer.residual_rows]]) * offsets
     except np.linalg.LinAlgError:
-        return None
-    rows = np.concatenate([gains[observer.fault_rows], gains[observer.residual_rows]]) * offsets
+        rows = np.full((1, len(offsets)), np.nan)
     if not np.isfinite(rows).all():
-        return None
+        raise SpecError(
+            "The design integrates a measurement: what an offset of a sensor does to it never settles, and no room for "
+            "a drift is enough. Leave sensor_drift at 0.",
+            path="sensor_drift",
+        )
     steady = np.repeat(rows.T[:, None], max(AGES) + MOST_ORDER, axis=1)
     nothing = np.zeros((len(offsets), 0, 0))
-    return SensorDrifts(steady, nothing, nothing, nothing)
+    return SensorDrifts(steady, nothing, nothing, nothing, offsets)
 
 
 def drifts_by_runs(run: Callable[[FloatArray], Any], offsets: FloatArray) -> SensorDrifts:
@@ -134,7 +153,8 @@ def drifts_by_runs(run: Callable[[FloatArray], Any], offsets: FloatArray) -> Sen
             continue
         first, second = usual.scores.chosen(slice(half, None)), other.scores.chosen(slice(half, None))
         parts.append((watched, *_of_scores(first, second, centre)))
-    return SensorDrifts(*(np.array(column) for column in zip(*parts, strict=True)))
+    watched, away, information, theta = (np.array(column) for column in zip(*parts, strict=True))
+    return SensorDrifts(watched, away, information, theta, offsets)
 
 
 def _of_scores(usual: Scores, other: Scores, centre: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -103,5 +103,6 @@ def _payload(learned: LearnedThresholds) -> dict[str, Any]:
         "levels": dict(zip(learned.statistics.names, learned.levels.tolist(), strict=True)),
         "logs": learned.logs,
         "sensor_drift": learned.sensor_drift,
+        "without_drift": list(learned.without_drift),
         "healthy_time": learned.healthy_time._asdict(),
     }
