@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from obsynth import PolytopicSystem, PreconditionError, SpecError
+from obsynth.analysis.existence.turning_filter import TurningFilter, turning_conditions
 from obsynth.conditions import turning_errors, turning_faults
 from obsynth.methods.engines.vertex_certificates import best_decay
 from obsynth.proofs.vertex_inequalities import Witness, prove_decay
@@ -125,3 +126,20 @@ def test_more_than_two_vertices_are_refused_by_name() -> None:
         turning_faults(plant)
     with pytest.raises(SpecError, match="decay"):
         turning_faults(turning_plant(), decay=1.5)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-14, 1e-13, 1e-12])
+def test_what_is_rounding_to_the_rank_is_no_direction_of_the_correction(rounding: float) -> None:
+    """Faults that are parallel but for rounding: equations that agree to it ask nothing of the correction."""
+    rng = np.random.default_rng(1)
+    first = np.array([1.0, 0.4, 0.3, 0.2])
+    # The fourth state is not measured: there the rounding is a hundred times as large as in what the outputs show.
+    second = 0.7 * first + rounding * rng.normal(size=4) * np.array([0.01, 0.01, 0.01, 1.0])
+    for unit in (1.0, 1e-6):
+        a, b = (unit * each for each in (first, second))
+        plant = turning_plant(Bf=[[f"{x} + {y - x} * v"] for x, y in zip(a.tolist(), b.tolist(), strict=True)])
+        made: list[TurningFilter] = []
+        assert all(condition.holds for condition in turning_conditions(plant, made))
+        assert max(np.abs(K).max() for K in made[0].K0) < 1.0
+        # One fault, of one direction at both vertices: of six outputs two are used, and four are free.
+        assert made[0].U[0].shape == (3, 4)

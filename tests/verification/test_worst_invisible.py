@@ -8,7 +8,7 @@ import pytest
 
 import obsynth
 from obsynth.verification import invisible_faults
-from obsynth.verification.invisible_faults import PRECISION_BITS, Setting, proved_least, seen_plant
+from obsynth.verification.invisible_faults import PRECISION_BITS, Setting, proved_least, proved_limit, seen_plant
 
 LAG = (np.array([[-2.0]]), np.array([[2.0]]), np.array([[1.0]]), np.array([[0.0]]))
 #: What each problem is: sampling, settings, points that are invisible, and last samples.
@@ -59,3 +59,15 @@ def test_directions_that_are_wrong_prove_less(name: str, monkeypatch: pytest.Mon
     assert bound is None or bound <= most * (1.0 + 1e-12)
     # What falls short is proved with all signals.
     assert proved_least(plant, points, samples, setting, level=0.999 * most) >= 0.999 * most
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_points_inside_prove_nothing(name: str) -> None:
+    """What grows into the past has no energy: with such a point the sums that a proof takes for energies are none."""
+    plant, points, samples, setting = problem(name, 0)
+    assert proved_least(plant, points, samples, setting, level=1.0, enough=0.0) is not None
+    edge, inside = (1.0, 0.8 + 0.3j) if plant.dt > 0.0 else (1j, -0.5 + 0.2j)
+    for wrong in (edge, inside, complex(np.nan), 0.0):
+        for listed in ([wrong], [*points, wrong], [wrong, *points]):
+            assert proved_least(plant, [complex(p) for p in listed], samples, setting, level=1.0, enough=0.0) is None
+        assert proved_limit(plant, complex(wrong), setting) is None

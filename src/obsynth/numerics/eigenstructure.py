@@ -259,10 +259,11 @@ def checked_poles(
 
 def as_pole(pole: Any) -> complex:
     """Return a pole that is given as a number, or as its real and imaginary part."""
+    parts = pole if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else [pole]
     try:
-        value = complex(*pole) if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else complex(pole)
+        value = complex(*parts)
     except (TypeError, ValueError):
         raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES_OPTION) from None
-    if isinstance(pole, (bool, str)) or not np.isfinite(value):
+    if any(isinstance(part, (bool, np.bool_, str)) for part in parts) or not np.isfinite(value):
         raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES_OPTION)
     return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,22 @@ def mean_miss(computed: Sequence[complex] | ComplexArray, wanted: Sequence[compl
     values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
     if values.size < goal.size:
         return float("inf")
-    groups = _groups(values, goal, dt)
-    return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
+    return max((abs(complex(np.mean(group.misses))) for group in pole_groups(values, goal, dt)), default=0.0)
+
+
+def multiple_miss(
+    computed: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float
+) -> float:
+    """Return the larger of `mean_miss` and, of each group of m poles that are the same, what moves one that far.
+
+    What moves the mean of m equal poles by a share moves each of them by its m-th root at most: a pole that misses by
+    ``d < 1`` needs ``d**m``.  A number that is compared with a tolerance bounds each pole by ``tolerance**(1/m)`` then.
+    """
+    values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
+    if values.size < goal.size:
+        return float("inf")
+    misses = [float(group.needed.max()) for group in pole_groups(values, goal, dt)]
+    return max([mean_miss(values, goal, dt), *misses])
 
 
 def farthest_pole(
@@ -91,20 +106,34 @@ def farthest_pole(
     values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
     if values.size != goal.size or not np.all(np.isfinite(values)):
         return float("inf")
-    return max((float(np.max(np.abs(misses))) for misses in _groups(values, goal, dt)), default=0.0)
+    return max((float(np.max(np.abs(group.misses))) for group in pole_groups(values, goal, dt)), default=0.0)
 
 
-def _groups(computed: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:
-    """Return, for each group of wanted poles that are the same, by how much eigenvalues miss them, relatively.
+class PoleGroup(NamedTuple):
+    """Wanted poles that are the same: which of the computed ones are assigned to them, and by how much these miss."""
 
-    There are as many eigenvalues at least."""
+    computed: NDArray[np.intp]
+    misses: ComplexArray  # relative to the wanted pole's size, in discrete time to the unit circle
+
+    @property
+    def needed(self) -> FloatArray:
+        """The share of a perturbation that moves one of m equal poles as far as each misses."""
+        sizes = np.abs(self.misses)
+        # Beyond its own size no pole is moved by rounding, and a power might overflow.
+        return np.where(sizes < 1.0, np.minimum(sizes, 1.0) ** len(sizes), sizes)
+
+
+def pole_groups(computed: ComplexArray, goal: ComplexArray, dt: float) -> list[PoleGroup]:
+    """Return, for each group of wanted poles that are the same, which poles are theirs: the least distances in sum.
+
+    There are as many computed poles at least."""
     from scipy.optimize import linear_sum_assignment
 
     if goal.size == 0:
         return []
     rows, columns = linear_sum_assignment(np.abs(computed[:, None] - goal[None, :]))
-    assigned = np.empty_like(goal)
-    assigned[columns] = computed[rows]
+    places = np.empty(goal.size, dtype=np.intp)
+    places[columns] = rows
     largest = float(np.max(np.abs(goal))) or 1.0
     groups, waiting = [], np.arange(goal.size)
     while waiting.size:
@@ -116,7 +145,7 @@ def _groups(computed: ComplexArray, goal: ComplexArray, dt: float) -> list[Compl
         group, waiting = waiting[same], waiting[~same]
         # A pole at zero is compared with the others.
         size = 1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)
-        groups.append(np.asarray((assigned[group] - goal[group]) / size))
+        groups.append(PoleGroup(places[group], np.asarray((computed[places[group]] - goal[group]) / size)))
     return groups
 
 

@@ -105,7 +105,8 @@ def proved_least(
     plant : DescriptorSystem
         As `seen_plant` returns it: its disturbances are those that never reach the error.
     points : sequence of complex
-        Outside the unit circle, or right of the imaginary axis; conjugates are added.
+        Outside the unit circle, or right of the imaginary axis: with another one nothing is proved.  Conjugates are
+        added.
     samples : int
         Last samples, discrete time, that are free: at least the longest delay.
     setting : Setting
@@ -116,6 +117,8 @@ def proved_least(
         A bound that is enough, by default the level: a combination in double precision that reaches it is taken.
     """
     if plant.is_discrete and (samples < max(setting.longest, 1) or not has_index_one(plant)):
+        return None
+    if not all(_grows(flint.acb(point), plant) for point in points):
         return None
     samples = samples if plant.is_discrete else 0
     bound = _of_worst_directions(plant, points, samples, setting, level if enough is None else enough)
@@ -186,6 +189,8 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
 
     Of the signals ``v s^t`` of one point next to the unit circle: a delay takes ``|s|`` off their ratio per sample.
     """
+    if not _grows(flint.acb(point), plant):
+        return None
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
@@ -204,6 +209,11 @@ def has_index_one(plant: DescriptorSystem) -> bool:
     nothing = np.zeros_like(plant.E)
     whole = np.block([[plant.E, plant.A], [nothing, plant.E]])
     return decide_rank(whole).rank == plant.nx + decide_rank(plant.E).rank
+
+
+def _grows(point: Any, plant: DescriptorSystem) -> bool:
+    """Whether the signals of a point, a complex ball, end with finite energy now: it is outside, or on the right."""
+    return bool(point.abs_lower() > 1 if plant.is_discrete else point.real > 0)
 
 
 def _complex(matrix: Any) -> Any:
@@ -287,8 +297,8 @@ class _Trajectories:
             zero = _zero_near(still, moved, point)
             if zero is None:
                 return []
-            growing = zero.point.abs_lower() > 1 if plant.is_discrete else zero.point.real > 0
-            return [zero] if growing else []
+            # A point at the edge may lead to a zero on the other side of it: the others are a witness without it.
+            return [zero] if _grows(zero.point, plant) else []
         pivots, others = _pivots(still + point * moved)
         exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
         solved = _columns(exact, pivots).solve(-_columns(exact, others))

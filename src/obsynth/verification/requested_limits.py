@@ -14,11 +14,11 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number, is_number, real_array, shown
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.eigenstructure import as_pole
 from obsynth.numerics.regions import LMIRegion, NamedRegion, checked_region
-from obsynth.numerics.spectra import mean_miss
+from obsynth.numerics.spectra import multiple_miss, pole_groups
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
@@ -61,26 +61,35 @@ def requested_rows(
         yield nothing_wrong(
             "requested bounds", f"what is claimed is within {', '.join(asked)} of the options", wrong, source=_SOURCE
         )
-    if not isinstance(observer, LinearObserver) or not observer.order:
+    wanted = {name: options[name] for name in ("decay", "region", "poles") if name in placed and name in options}
+    wanted = {name: value for name, value in wanted.items() if value is not None}
+    if not isinstance(observer, LinearObserver):
+        # One that changes with the scheduling has no poles: what bounds its errors is a claim.
+        wrong = [name for name in wanted if name not in limits]
+        if wrong:
+            claim = "no poles are requested of an observer that changes with the scheduling"
+            yield nothing_wrong("requested poles", claim, wrong, source=_SOURCE)
         return
     modes = _Modes(design, observer, fixed_modes)
-    decay, region, poles = (options.get(name) if name in placed else None for name in ("decay", "region", "poles"))
-    rate = float(decay) if decay is not None and is_number(decay) else 0.0
-    if rate > 0.0:
-        yield _decay_row(modes, rate)
+    decay, region, poles = (wanted.get(name) for name in ("decay", "region", "poles"))
+    if decay is not None and not is_finite_number(decay):
+        yield nothing_wrong("requested decay", "decay is a number", [f"it is {shown(decay)}"], source=_SOURCE)
+    elif decay is not None and float(decay) > 0.0 and observer.order:
+        yield _decay_row(modes, float(decay))
     try:
         where = None if region is None else region_of(region, observer.dt)
         readings = [] if poles is None else _readings(poles)
     except (SpecError, TypeError, ValueError) as error:
         yield nothing_wrong("requested poles", "region and poles are readable", [str(error)], source=_SOURCE)
         return
-    if where is not None:
+    if where is not None and observer.order:
         yield _region_row(modes, where)
     if readings:
-        missed = min(mean_miss(modes.poles, wanted, observer.dt) for wanted in readings)
+        missed = min(multiple_miss(modes.poles, reading, observer.dt) for reading in readings)
         yield upper_bound_check(
             "requested poles",
-            "the poles of the options are among those of the observer, each within this share of its size",
+            "the poles of the options are among those of the observer, each within this share of its size; m equal "
+            "ones by their mean, and each within the m-th root",
             missed,
             POLE_TOLERANCE,
             source=_SOURCE,
@@ -110,19 +119,22 @@ class _Modes:
 
     @cached_property
     def movable(self) -> ComplexArray:
-        """The poles without those nearest to the fixed ones."""
-        left = self.poles
-        for mode in self.fixed:
-            if left.size:
-                left = np.delete(left, int(np.argmin(np.abs(left - mode))))
-        return left
+        """The poles without the fixed ones, each of which must be where the plant has it."""
+        poles, fixed = self.poles, np.asarray(self.fixed, dtype=np.complex128)
+        if not fixed.size or fixed.size > poles.size:
+            return poles
+        same = [group.computed[group.needed <= POLE_TOLERANCE] for group in pole_groups(poles, fixed, self.observer.dt)]
+        return np.delete(poles, np.concatenate(same))
 
 
 def region_of(region: Any, dt: float) -> LMIRegion:
     """Return the region of an option: by name (decay, radius, damping), by its matrices, or as `checked_region` takes
     it."""
     if isinstance(region, Mapping) and region.keys() == {"L", "M"}:
-        return LMIRegion(np.array(region["L"], dtype=float), np.array(region["M"], dtype=float), "the region")
+        L, M = (real_array(region[name], f"region.{name}") for name in ("L", "M"))
+        if L.ndim != 2 or L.shape != L.shape[::-1] or M.shape != L.shape or not np.isfinite([L, M]).all():
+            raise SpecError("region: L and M are no square matrices of one size.", path="region")
+        return LMIRegion(L, M, "the region")
     if isinstance(region, Mapping) and set(region) <= {field.name for field in fields(NamedRegion)}:
         stated = {name: value for name, value in region.items() if value is not None}
         return NamedRegion.of(stated, dt).as_inequality(dt)
@@ -132,8 +144,8 @@ def region_of(region: Any, dt: float) -> LMIRegion:
 def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], ...]) -> Iterator[str]:
     """Yield what is claimed and is not within an option."""
     claims, value = design.certificate.claims, design.options[name]
-    numbers = list(value) if isinstance(value, (list, tuple)) else [value]
-    if len(numbers) != len(bounds) or not all(map(is_number, numbers)):
+    numbers = list(value) if len(bounds) > 1 and isinstance(value, (list, tuple)) else [value]
+    if len(numbers) != len(bounds) or not all(map(is_finite_number, numbers)):
         yield f"{name} is not {len(bounds)} number{'s' if len(bounds) > 1 else ''}"
         return
     for number, (claim, bound) in zip(map(float, numbers), bounds, strict=True):
@@ -185,6 +197,8 @@ def _outside(values: ComplexArray, region: LMIRegion) -> float:
 
 def _readings(poles: Any) -> list[list[complex]]:
     """Return what a list of poles may mean: a pair of numbers is one pole, or the two of one of several filters."""
+    if not isinstance(poles, (list, tuple, np.ndarray)):
+        raise SpecError(f"poles are no list, but {shown(poles)}.", path="poles")
     pairs, lists = list[complex](), list[complex]()
     for entry in poles:
         several = isinstance(entry, (list, tuple, np.ndarray))

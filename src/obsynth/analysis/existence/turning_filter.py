@@ -118,12 +118,22 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     if reach is None:
         return
     m = plant.ny
-    K0 = target @ np.linalg.pinv(rows)
-    U = np.linalg.svd(rows)[0][:, freedom.rank :]
+    K0, U = _corrections(rows, target, freedom.rank)
     halves = [slice(i * m, (i + 1) * m) for i in range(plant.count)]
     made.append(
         TurningFilter(T, N, W, tuple(K0[:, half] for half in halves), tuple(U[half] for half in halves), Delta, reach)
     )
+
+
+def _corrections(rows: FloatArray, target: FloatArray, rank: int) -> tuple[FloatArray, FloatArray]:
+    """Return the least K0 with ``K0 G = H``, and U with ``U' G = 0``: of G ``(N ny, pairs nf)`` with a decided rank.
+
+    Equations in units of their own are as many as the rank counts; what is beyond it is rounding, and no direction."""
+    units = np.linalg.norm(rows, axis=0)
+    units = np.where(units > 0.0, units, 1.0)
+    left, sizes, right = np.linalg.svd(rows / units)
+    K0 = (target / units) @ (right[:rank].T / sizes[:rank]) @ left[:, :rank].T
+    return np.asarray(K0), np.asarray(left[:, rank:])
 
 
 def _equations(C: FloatArray, driven: list[FloatArray]) -> tuple[FloatArray, FloatArray]:

@@ -19,6 +19,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
 from obsynth.numerics.ranks import decide_rank
+from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.vertex_inequalities import VertexProof, Witness, prove_decay, prove_gain, prove_mean_square
 from obsynth.verification.error_polytope import ErrorPolytope
 
@@ -35,6 +36,8 @@ MOST_RESCALINGS = 4
 NEGLIGIBLE = (1e-4, 1e-3, 1e-2)
 #: Steps by which a decay that is not proved is made slower, towards none.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
+#: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
+CLAIM_ROUNDINGS = 6
 #: Trials of a bisection for the best decay, and where it ends.
 MOST_BISECTIONS = 40
 BISECTION_SHARE = 1e-3
@@ -69,6 +72,10 @@ class VertexCertificate:
     decay: float
     proof: VertexProof
     runs: tuple[Mapping[str, Any], ...]
+
+    def gain_times(self, reach: float) -> float:
+        """Return the level times a bound ``reach``, which no rounding of the product and its quotient brings below."""
+        return float(rounded_up(np.asarray(self.level * reach), CLAIM_ROUNDINGS))
 
 
 def certified(

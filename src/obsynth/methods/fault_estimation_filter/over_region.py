@@ -89,7 +89,7 @@ def _synthesis(
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}
     if plant.nd:
         claims |= {
-            "gamma": _rounded_above(certificate.level * parts.reach),
+            "gamma": certificate.gain_times(parts.reach),
             "gamma_min": certificate.least * parts.reach,
         }
     return Synthesis(
@@ -179,11 +179,6 @@ def _realised(
         fault_delays=first.fault_delays,
     )
     return observer, tracking
-
-
-def _rounded_above(value: float) -> float:
-    """Return a number that no rounding of a product and its quotient brings below ``value``."""
-    return value * (1.0 + 8.0 * float(np.finfo(np.float64).eps))
 
 
 def _notes(

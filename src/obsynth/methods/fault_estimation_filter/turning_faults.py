@@ -25,9 +25,6 @@ from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.over_region import rows_to_forget, stored_witness
 
-#: What no rounding of a product and its quotient brings below a number.
-_ABOVE = 1.0 + 8.0 * float(np.finfo(np.float64).eps)
-
 
 def synthesise_turning(
     plant: PolytopicSystem, method: FaultEstimationFilter, parts: TurningFilter, *, progress: Callable[[str], None]
@@ -43,7 +40,7 @@ def synthesise_turning(
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}
     if plant.nd:
         claims |= {
-            "gamma": certificate.level * parts.reach * _ABOVE,
+            "gamma": certificate.gain_times(parts.reach),
             "gamma_min": certificate.least * parts.reach,
         }
     observer = _observer(plant, parts, K, certificate.decay)
