@@ -40,6 +40,8 @@ SAMPLED = obsynth.DescriptorSystem(
 SMALL = SAMPLED.replace(Bd=None, Dd=None, disturbance_names=None)
 SMOOTH = SMALL.replace(A=A - 2.0 * np.eye(3), dt=0.0)
 NOISY = SMOOTH.replace(Bd=[[0.3], [0.0], [0.1]], Dd=np.zeros((2, 1)), Bw=np.zeros((3, 2)), Dw=0.3 * np.eye(2))
+#: Every output has noise of its own, so that no filter's gain is zero.
+LOUD = SAMPLED.replace(Bw=np.zeros((3, 2)), Dw=0.3 * np.eye(2), noise_names=None)
 TEST = {"noise_bound": {"y1": 0.1, "y2": 0.1}, "disturbance_bounds": {"d1": 0.05}, "course": "constant", "samples": 8}
 #: What the file of each method proves.
 CLAIMS: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], set[str]]] = {
@@ -51,7 +53,7 @@ CLAIMS: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], set[str]]] = {
         {"identities", "stable", "rounding", "fault models", "deviation"},
     ),
     "detection-filter": (NOISY, {}, {"identities", "stable", "rounding", "gain"}),
-    "optimal-filter": (SAMPLED, {}, {"identities", "stable", "rounding"}),
+    "optimal-filter": (LOUD, {}, {"identities", "stable", "rounding", "faults", "gain", "deviation"}),
     "guaranteed-test": (SAMPLED, TEST, {"threshold", "least"}),
 }  # fmt: skip
 EACH = pytest.mark.parametrize("method", CLAIMS)
@@ -146,12 +148,61 @@ def test_the_page_says_what_each_file_proves_and_leaves() -> None:
     assert named == set(REGISTRY) - set(CLAIMS)
 
 
+def test_the_gain_of_an_optimal_filter_is_proved_and_no_smaller_one() -> None:
+    """From disturbances and noise together, to a billionth: a smaller level than the filter's own norm is refused."""
+    design = design_of("optimal-filter")
+    stated = {claim["claim"]: claim for claim in proof("optimal-filter")["claims"]}["gain"]
+    gamma = float(as_array(stated["gamma"]).item())
+    assert design.certificate.claims["gain"] <= gamma <= design.certificate.claims["gain"] * (1.0 + 1e-8)
+    assert (stated["signal"], stated["rows"]) == ("disturbances and noise", ["fault"])
+    points = np.exp(1j * np.linspace(0.0, np.pi, 401))
+    (plant, observer), T = design.linear, design.certificate.matrices["T"]
+    T = T[:, : plant.nx]
+    b, d = np.hstack([plant.Bd, plant.Bw]), np.hstack([plant.Dd, plant.Dw])
+    T0 = -design.certificate.matrices["T0"][:, : plant.nx]
+    into, through = T @ b - observer.By @ d, observer.Dy @ d + T0 @ b
+    solved = [np.linalg.solve(z * np.eye(observer.order) - observer.Az, into) for z in points]
+    norm = max(np.linalg.norm(through - observer.Cz @ each, 2) for each in solved)
+    assert norm <= gamma <= norm * (1.0 + 1e-3)
+    changed = proof("optimal-filter")
+    place = next(i for i, claim in enumerate(changed["claims"]) if claim["claim"] == "gain")
+    changed["claims"][place]["gamma"] = as_data(np.array([[0.999 * norm]]))
+    assert "positive definite" in refused(changed)
+
+
 def test_what_an_optimal_filter_claims_besides_is_named() -> None:
-    """Its gain and the least of any filter are proved by `verify` alone: the file says so."""
-    assert "gain" in design_of("optimal-filter").certificate.claims
-    left = proof("optimal-filter")["not_covered"]
-    assert "the gain of this filter" in left
-    assert any("no causal filter has less" in text for text in left)
+    """The format has no weights, no reference model and no estimate without delay: what needs these is named."""
+    constant = {name: np.zeros(shape) for name, shape in (("A", (0, 0)), ("B", (0, 1)), ("C", (1, 0)))}
+    cases = {
+        "weights": obsynth.optimal_filter(LOUD, delay=1, weights={"errors": {"f1": 2.0}}),
+        "a reference model": obsynth.optimal_filter(LOUD, reference={**constant, "D": [[0.1]]}, exact=False),
+    }
+    for name, design in cases.items():
+        file = proof_of(design)
+        assert not refused(json.loads(proof_bytes(file))), name
+        assert "gain" not in {claim["claim"] for claim in file["claims"]}, name
+        assert any(text.startswith("the gain ") for text in file["not_covered"]), name
+        assert any("no causal filter has less" in text for text in file["not_covered"])
+    assert "the fault map" in proof_of(cases["a reference model"])["not_covered"]
+    assert "the fault map" not in proof_of(cases["weights"])["not_covered"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(6))
+def test_gains_of_random_optimal_filters_are_proved(seed: int) -> None:
+    """Whether the design has a P or its eigenvalues were enclosed."""
+    rng = np.random.default_rng([46, seed])
+    n = int(rng.integers(2, 6))
+    a = rng.normal(size=(n, n))
+    plant = obsynth.DescriptorSystem(
+        A=rng.uniform(0.5, 1.2) * a / np.max(np.abs(np.linalg.eigvals(a))), C=rng.normal(size=(3, n)),
+        Bf=rng.normal(size=(n, 1)), Bd=rng.normal(size=(n, 1)), Bw=np.hstack([0.3 * np.eye(n), np.zeros((n, 3))]),
+        Dw=np.hstack([np.zeros((3, n)), 0.1 * np.eye(3)]), dt=1.0,
+    )  # fmt: skip
+    design = obsynth.optimal_filter(plant, delay=1, decoupled=["d1"] if seed % 2 else [])
+    file = json.loads(proof_bytes(proof_of(design)))
+    assert not refused(file)
+    assert {"gain", "faults"} <= {claim["claim"] for claim in file["claims"]}, file["not_covered"]
 
 
 def test_the_program_imports_nothing_but_the_standard_library() -> None:

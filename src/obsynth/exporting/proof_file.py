@@ -7,8 +7,8 @@ What a design claims and the file does not prove is listed in it by name.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,8 @@ from flint import fmpz_mat
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.exporting.proof_of_tests import test_claims
 from obsynth.files.outputs import write_atomically
+from obsynth.methods.optimal_filter.certificate import gain_matrix
+from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
@@ -42,6 +44,7 @@ from obsynth.proofs.witnesses import (
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.invisible_faults import seen_plant
 
 PROOF_FORMAT, PROOF_VERSION = "obsynth-proof", 1
 #: A claimed rate of decay is proved for all but this share of it, as `obsynth.verify` does.
@@ -52,6 +55,8 @@ CONTRACTION_SHARES = (0.5, 0.9, 0.1, 0.01)
 STABILITY_SHARES = (0.9, 0.5, 0.1, 0.01)
 #: A norm is proved for the claimed one, or for one larger by rounding.
 NORM_ROOM = (1.0, 1.0 + 1e-12, 1.0 + 1e-9)
+#: An optimal filter's gain that is proved without a P has one a little above: the file states the first that is proved.
+GAIN_ROOMS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 #: A share that is a power of two itself is stated as the next one: its logarithm is rounded.
 LOGARITHM_ROOM = 1e-9
 #: Identities are stated to a power of two of their terms, and of this share of the largest in a column.
@@ -76,7 +81,7 @@ _NOT_COVERED: Mapping[str, list[str]] = {
     "ui-pi-observer": ["that the poles are the claimed ones: their decay alone", "a region of poles"],
     "functional-filter": ["deviations with random walks of the faults", "that estimates are free of other faults"],
     "detection-filter": ["the least sensitivity to faults over the band"],
-    "optimal-filter": ["the gain of this filter", "that no causal filter has less", "the fault map"],
+    "optimal-filter": ["that no causal filter has less"],
     "guaranteed-test": ["the mean threshold over tolerances", "that no test is insensitive to more faults"],
 }  # fmt: skip
 
@@ -229,6 +234,8 @@ class _Proof:
         if self.observer.order:
             self._add("stability: no Lyapunov matrix was found", self._stable(system))
             self._add_contraction(system)
+        else:
+            self._add_faults(system, None)
         self._add_gains(system)
         self._add_deviation(system)
 
@@ -245,18 +252,43 @@ class _Proof:
         contraction_and_witness = system.contraction()
         if contraction_and_witness is None:
             self.not_covered.append("what rounding of stored numbers adds: no contraction was found")
+            self._add_faults(system, None)
             return
         contraction, self.witness = contraction_and_witness
         self._add("what rounding of stored numbers adds: too much for an estimate", system.rounding_claim(contraction))
-        discrete = self.plant.dt > 0.0
-        if self.design.method == "fault-estimation-filter" and discrete:
-            self._add("each fault's own estimate: rounding may hide it", system.faults_claim(contraction))
+        self._add_faults(system, contraction)
         matrices = self.design.certificate.matrices
         if {"tracking", "Phi", "Cw", "T0"} <= matrices.keys() and len(matrices["Phi"]):
             mean = int(self.design.options.get("mean", 1))
             delay = int(self.design.options.get("delay", 0))
             claim = system.fault_models_claim(contraction, matrices, delay=delay, mean=mean)
             self._add("faults that follow their models are estimated as they are", claim)
+
+    def _add_faults(self, system: _Exact, contraction: _Contraction | None) -> None:
+        """Add that faults of any course are estimated; of an optimal filter this is the fault map, where it is late."""
+        optimal = self.design.method == "optimal-filter"
+        if not optimal and not (self.design.method == "fault-estimation-filter" and self.plant.dt > 0.0):
+            return
+        late = not optimal or min(self.observer.fault_delays, default=0) > 0
+        name = "the fault map" if optimal else "each fault's own estimate: rounding may hide it"
+        self._add(name, system.faults_claim(contraction) if late and contraction is not None else None)
+
+    def _add_gain_of_optimal_filter(self, system: _Exact) -> None:
+        """Add the gain from noise where faults pass by an exact map without weights: the format has no other error."""
+        (certificate, options), plant = (self.design.certificate, self.design.options), self.plant
+        if "gain" not in certificate.claims:
+            return
+        gain, claim = certificate.claims["gain"], None
+        if options.get("exact") and options.get("weights") is None:
+            # Its P is of the error in units of its own.  What is decoupled adds its rounding, and is no exception.
+            channel = ErrorChannel(replace(system.model, plant=seen_plant(plant, ()))).in_units_of(gain)
+            rows = ["fault"] if self.observer.fault_names else ["residual"]
+            signal = "disturbances and noise" if plant.nd else "noise"
+            for level, P in _gain_witnesses(channel, gain, certificate.matrices.get("P"), plant.dt):
+                p = Dyadic.of(0.5 * (P + P.T)).scaled(channel.unit).scaled(channel.unit)
+                if (claim := system.gain_claim(signal, rows, level, p)) is not None:
+                    break
+        self._add(f"the gain {gain:.6g} of this filter", claim)
 
     def _add_gains(self, system: _Exact) -> None:
         certificate, plant = self.design.certificate, self.plant
@@ -274,11 +306,28 @@ class _Proof:
             p = dual_matrix(0.5 * (matrices["P"] + matrices["P"].T), gain)
             claim = None if p is None else system.gain_claim("disturbances and noise", ["residual"], gain, p)
             self._add(f"the l2 gain {gain:.6g} from unknown inputs and noise", claim)
+        if self.design.method == "optimal-filter":
+            self._add_gain_of_optimal_filter(system)
 
     def _add_deviation(self, system: _Exact) -> None:
         rows = ["fault"] if self.observer.fault_names else ["residual"]
         if self.plant.nw and self.observer.order and (self.plant.Bw.any() or self.plant.Dw.any()):
             self._add(f"standard deviations under {noise_words(self.plant.noise_names)}", system.deviation_claim(rows))
+
+
+def _gain_witnesses(
+    channel: ErrorChannel, gain: float, P: FloatArray | None, dt: float
+) -> Iterator[tuple[float, FloatArray]]:
+    """Yield levels with a P that may prove them: the stored one, or where there is none of levels a little above."""
+    if P is not None:
+        yield gain, P
+        return
+    poles = np.abs(poles_of(channel.model.observer))
+    # Where frequencies are mapped to the circle of samples, in continuous time: near those of the filter.
+    alpha = float(np.exp(np.mean(np.log(poles[poles > 0.0])))) if dt == 0.0 and np.any(poles > 0.0) else 1.0
+    for room in GAIN_ROOMS:
+        if (P := gain_matrix(channel, gain * (1.0 + room), dt, alpha)) is not None:
+            yield gain * (1.0 + room), P
 
 
 def rows_of(observer: LinearObserver) -> list[tuple[str, str, int]]:
