@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
-from obsynth.analysis.existence.nonlinear_region import region_conditions
+from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES, region_conditions
 from obsynth.conditions.polytope import vertex_inequalities
 from obsynth.conditions.problem import Conditions
 from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
+from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.operating_region import OperatingRegion
@@ -49,7 +50,7 @@ def nonlinear_region(
     goal : {"gain", "power", "decay"}, optional
         What is made small.
     multiplier : {"vertices", "full", "diagonal"}, optional
-        All corners of the slopes, or one inequality.
+        All corners of up to 12 slopes, or one inequality.
     faults, wanted, decay : optional
         As for `obsynth.region_observer`.
 
@@ -99,6 +100,10 @@ def nonlinear_region(
         "differential": nd if nd < n else None,
     }
     if multiplier == "vertices":
+        if len(slopes) > MOST_CORNER_SLOPES:
+            raise SpecError(
+                f"{len(slopes)} slopes have 2 ** {len(slopes)} corners: take multiplier='diagonal'.", path="multiplier"
+            )
         corners = corners_of(bounds)
         errors = ErrorPolytope(
             [terms.A + W @ np.diag(d) @ V for d in corners], [terms.C + Wy @ np.diag(d) @ V for d in corners], **shared

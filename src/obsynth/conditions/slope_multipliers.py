@@ -28,8 +28,10 @@ from obsynth.conditions.lmi import MARGIN
 from obsynth.conditions.polytope import MOST_ROOM, TRACE, descriptor_variables
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, chosen, shown
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import arguments_checked, chosen, require_shape, shown
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.proofs.extended_balls import Enclosed
+from obsynth.proofs.slope_blocks import SlopeBlock
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_polytope import ErrorPolytope
 
@@ -59,6 +61,15 @@ class SlopedErrors:
         """Number of slopes."""
         return int(self.W.shape[1])
 
+    def closed(self, gain: FloatArray) -> SlopeBlock:
+        """Return how the closed error system is formed, of a gain ``(n, m)``."""
+
+        def slopes(kind: type[Enclosed]) -> tuple[Enclosed, Enclosed]:
+            exact = kind.exact
+            return exact(self.W) - exact(gain) @ exact(self.Wy), exact(self.V)
+
+        return SlopeBlock(self.nominal.closed([gain])[0], slopes, self.count)
+
 
 @arguments_checked
 def slope_inequality(
@@ -66,7 +77,10 @@ def slope_inequality(
     *,
     goal: str = "gain",
     multiplier: str = "full",
+    level: float | None = None,
     decay: float | None = None,
+    gain: FloatArray | None = None,
+    gain_limit: float | None = None,
     margin: float = MARGIN,
 ) -> Conditions:
     """Return the inequality with a multiplier, in P and Y.
@@ -79,15 +93,22 @@ def slope_inequality(
         The least L2 gain, the least mean square for unit white w, or the largest slack of ``decay``.
     multiplier : {"full", "diagonal"}, optional
         A full one for up to six slopes.
+    level : float, optional
+        A given gain (or root mean square): the largest slack at that level is sought instead.
     decay : float, optional
         Errors decay at least like ``exp(-decay t)``.
+    gain : array_like, optional
+        A given gain ``(n, m)``, which is analysed.
+    gain_limit : float, optional
+        The largest Frobenius norm of Y.
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
     Returns
     -------
     Conditions
-        Variables ``P1``, ``P2``, ``P3``, ``Y`` and ``gamma_squared``, ``mean_square`` or ``room``; gains ``L[1]``.
+        Variables ``P1``, ``P2``, ``P3``, ``Y`` and ``gamma_squared``, ``mean_square`` or ``room``; gains ``L[1]``, and
+        of a diagonal multiplier ``T[gain]``, ``T[power]``, ``T[decay]``.
 
     Raises
     ------
@@ -109,10 +130,16 @@ def slope_inequality(
     n, k, m, p = own.order, own.differential or own.order, own.outputs, own.inputs
     P, G = descriptor_variables(n, k)
     Y1 = cp.Variable((k, m), name="Y")
+    given = None if gain is None else as_matrix(gain, "gain")
+    if given is not None:
+        require_shape(given.shape, (n, m), "gain")
     Y = cp.vstack([Y1, np.zeros((n - k, m))]) if k < n else Y1
-    room = cp.Variable(name="room") if goal == "decay" else None
+    Y = Y if given is None else G.T @ given
+    room = cp.Variable(name="room") if goal == "decay" or level is not None else None
     slack: Any = margin if room is None else room
-    level = cp.Variable(nonneg=True, name="gamma_squared" if goal == "gain" else "mean_square")
+    name = "gamma_squared" if goal == "gain" else "mean_square"
+    squared: Any = cp.Variable(nonneg=True, name=name) if level is None else level**2
+    multipliers: dict[str, Any] = {}
     constraints: dict[str, Any] = {"P": lmi.at_least(P[:k, :k], slack)}
     GA, GW = G.T @ own.A[0] - Y @ own.C[0], G.T @ errors.W - Y @ errors.Wy
     GB, Z = G.T @ own.B[0] - Y @ own.D[0], own.Cz[0]
@@ -120,9 +147,11 @@ def slope_inequality(
     def with_multiplier(name: str, first: Any, *, driven: bool) -> None:
         Q, S, R, more = _multiplier(errors.count, multiplier, name)
         constraints.update(more)
+        if multiplier == "diagonal":
+            multipliers[f"T[{name}]"] = -R
         lower = [[-(2.0 * GA + first + errors.V.T @ Q @ errors.V)], [-(GW + errors.V.T @ S).T, -R]]
         if driven:
-            lower.append([-GB.T, np.zeros((p, errors.count)), level * np.eye(p)])
+            lower.append([-GB.T, np.zeros((p, errors.count)), squared * np.eye(p)])
         constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
 
     if goal == "gain":
@@ -130,19 +159,24 @@ def slope_inequality(
     if goal == "power":
         with_multiplier("power", Z.T @ Z, driven=False)
         noise = cp.Variable((p, p), symmetric=True)
-        constraints["trace"] = cp.trace(noise) + slack <= level
+        constraints["trace"] = cp.trace(noise) + slack <= squared
         constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
     if decay is not None:
         with_multiplier("decay", 2.0 * decay * P, driven=False)
     if room is not None:
-        constraints |= {"room": room <= MOST_ROOM, "trace": cp.trace(P) <= TRACE * n}
-    objective = cp.Minimize(level) if room is None else cp.Maximize(room)
-    variables = {part.name(): part for part in (*P.variables(), *G.variables(), Y1)}
-    variables |= {"room": room} if room is not None else {level.name(): level}
+        constraints["room"] = room <= MOST_ROOM
+    if goal == "decay":
+        constraints["trace"] = cp.trace(P) <= TRACE * n
+    if gain_limit is not None and given is None:
+        constraints["limit"] = cp.norm(Y1, "fro") <= gain_limit
+    objective = cp.Minimize(squared) if room is None else cp.Maximize(room)
+    variables = {part.name(): part for part in (*P.variables(), *G.variables(), *([Y1] if given is None else []))}
+    variables |= {"room": room} if room is not None else {name: squared}
 
     def gains(_: Values) -> dict[str, FloatArray]:
-        L = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value))
-        return {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)}
+        L = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value)) if given is None else given
+        values = {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)}
+        return values | {each: np.diag(np.asarray(T.value)) for each, T in multipliers.items()}
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
         raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")

@@ -38,6 +38,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block
+from obsynth.proofs.slope_blocks import SlopeBlock
 
 #: Weights at the vertices now and at the next sample.
 Pair = tuple[FloatArray, FloatArray]
@@ -67,6 +68,8 @@ class Witness:
         That of the remainder beside M.
     differential : int, optional
         How many of the errors are differential, in continuous time; all by default.
+    slopes : FloatArray, optional
+        Multipliers ``(q,)`` of slopes, where one block is proved in place of their corners.
     """
 
     P: Sequence[FloatArray]
@@ -74,6 +77,7 @@ class Witness:
     pairs: Sequence[Pair] | None = None
     multiplier: float = 0.0
     differential: int | None = None
+    slopes: FloatArray | None = None
 
     @property
     def order(self) -> int:
@@ -165,21 +169,21 @@ def pairs_of(count: int, steps: float | None) -> list[Pair]:
     return [(weights(now), weights(then)) for now, then in dict.fromkeys(corners)]
 
 
-def prove_gain(
-    vertices: Sequence[Vertex], witness: Witness, gain: float, *, discrete: bool, ball: float = 0.0
-) -> VertexProof:
+#: What is proved: vertices, or one block with the slopes of a plant.
+Proved = Sequence[Vertex] | SlopeBlock
+
+
+def prove_gain(vertices: Proved, witness: Witness, gain: float, *, discrete: bool, ball: float = 0.0) -> VertexProof:
     """Try to prove that the l2 (L2) gain from w to z is below ``gain`` for every trajectory of the weights."""
     return _proved(vertices, witness, discrete=discrete, ball=ball, gain=gain)
 
 
-def prove_decay(
-    vertices: Sequence[Vertex], witness: Witness, rate: float, *, discrete: bool, ball: float = 0.0
-) -> VertexProof:
+def prove_decay(vertices: Proved, witness: Witness, rate: float, *, discrete: bool, ball: float = 0.0) -> VertexProof:
     """Try to prove decay: ``rate ** k`` in discrete time, ``exp(-rate t)`` in continuous time."""
     return _proved(vertices, witness, discrete=discrete, ball=ball, decay=rate)
 
 
-def prove_mean_square(vertices: Sequence[Vertex], witness: Witness, level: float, *, discrete: bool) -> VertexProof:
+def prove_mean_square(vertices: Proved, witness: Witness, level: float, *, discrete: bool) -> VertexProof:
     """Try to prove that the mean of ``|z|^2`` is below ``level ** 2`` for unit white w, independent of the weights."""
     return _proved(vertices, witness, discrete=discrete, ball=0.0, power=level)
 
@@ -201,7 +205,7 @@ def prove_nonsingular(vertices: Sequence[FloatArray], right: FloatArray, room: f
 
 
 def _proved(
-    vertices: Sequence[Vertex],
+    vertices: Proved,
     witness: Witness,
     *,
     discrete: bool,
@@ -210,6 +214,8 @@ def _proved(
     decay: float | None = None,
     power: float | None = None,
 ) -> VertexProof:
+    if isinstance(vertices, SlopeBlock):
+        return _proved_block(vertices, witness, discrete=discrete, ball=ball, gain=gain, decay=decay, power=power)
     problem = witness.problem(len(vertices))
     if not problem and any(vertex(Ball)[0].shape != (witness.order, witness.order) for vertex in vertices):
         problem = "the certificate is of another order than the errors"
@@ -227,6 +233,37 @@ def _proved(
         if not made[-1][1].proved:
             break
     return VertexProof.of(made)
+
+
+def _proved_block(
+    made: SlopeBlock,
+    witness: Witness,
+    *,
+    discrete: bool,
+    ball: float,
+    gain: float | None,
+    decay: float | None,
+    power: float | None,
+) -> VertexProof:
+    """Prove one block with the slopes, in continuous time."""
+    problem = witness.problem(1) or made.problem(witness.slopes)
+    if discrete or ball:
+        problem = "a block with slopes is for continuous time, without a remainder"
+    if not problem and made.nominal(Ball)[0].shape != (witness.order, witness.order):
+        problem = "the certificate is of another order than the errors"
+    if not problem and not all(value is None or value >= 0.0 for value in (gain, decay, power)):
+        problem = "the number that is claimed is negative"
+    problem = problem or _flow_problem([made.nominal], witness, ball, power)
+    if problem or witness.slopes is None:
+        return VertexProof.of([("certificate", unproved(problem))])
+    P, k = witness.P[0], witness.differential or witness.order
+    G = P if witness.G is None else witness.G[0]
+    proofs = []
+    for place, formula in made.formulas(P, G, k, witness.slopes, gain=gain, decay=decay, power=power):
+        proofs.append((place, prove_positive_definite(formula)))
+        if not proofs[-1][1].proved:
+            break
+    return VertexProof.of(proofs)
 
 
 def _flow_problem(vertices: Sequence[Vertex], witness: Witness, ball: float, power: float | None) -> str:

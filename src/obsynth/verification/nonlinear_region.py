@@ -12,15 +12,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.operating_region import Slope
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms
 from obsynth.proofs.extended_balls import Enclosed
-from obsynth.proofs.vertex_inequalities import Vertex, Witness, prove_decay
+from obsynth.proofs.slope_blocks import SlopeBlock
+from obsynth.proofs.vertex_inequalities import Proved, Vertex, Witness, prove_decay
 from obsynth.verification.error_polytope import driven_by
 
-#: Corners that are proved one by one: 2 ** 12.
-MOST_CORNERS = 4096
+#: What a difference and a sum of two numbers are rounded by: the middle of bounds and half their width hold them.
+_HALF_ROOM = 1.0 + 8.0 * float(np.finfo(np.float64).eps)
 #: Halvings towards the fastest decay that a certificate proves.
 _HALVINGS = 24
 
@@ -52,8 +54,8 @@ def corner_errors(
     bounds: FloatArray,
     gain: FloatArray,
     drive: tuple[FloatArray, FloatArray, FloatArray],
-) -> list[Vertex]:
-    """Return how the error system is formed at each corner of the slopes.
+) -> list[Vertex] | SlopeBlock:
+    """Return how the error system is formed at each corner of the slopes; of many slopes that of the middle, with them.
 
     ``drive``: B ``(n, p)`` and D ``(ny, p)`` of the noise, and the errors that count, Cz ``(q, n)``.
     """
@@ -73,10 +75,25 @@ def corner_errors(
 
         return vertex
 
-    return [vertex_at(corner) for corner in corners_of(bounds)]
+    if len(slopes) <= MOST_CORNER_SLOPES:
+        return [vertex_at(corner) for corner in corners_of(bounds)]
+    middle, half = middle_and_half(bounds)
+
+    def into_and_out(kind: type[Enclosed]) -> tuple[Enclosed, Enclosed]:
+        exact = kind.exact
+        return (exact(W) - exact(L) @ exact(Wy)) @ exact(np.diag(half)), exact(V)
+
+    return SlopeBlock(vertex_at(middle), into_and_out, len(slopes))
 
 
-def fastest_decay(vertices: Sequence[Vertex], witness: Witness, limit: float) -> float:
+def middle_and_half(bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the middles ``(q,)`` of bounds ``(q, 2)`` and half their widths: rounded so that they hold the bounds."""
+    middle = 0.5 * (bounds[:, 0] + bounds[:, 1])
+    half = np.maximum(bounds[:, 1] - middle, middle - bounds[:, 0]) * _HALF_ROOM
+    return middle, np.nextafter(half, np.inf)
+
+
+def fastest_decay(vertices: Proved, witness: Witness, limit: float) -> float:
     """Return a rate near the fastest that a certificate proves, from a floating-point guess; 0 without any."""
     low, high = 0.0, limit
     if not prove_decay(vertices, witness, 0.0, discrete=False).proved:

@@ -23,6 +23,7 @@ from obsynth.proofs.extended_balls import Enclosed
 from obsynth.proofs.rated_inequalities import prove_rated_gain
 from obsynth.proofs.vertex_inequalities import (
     Pair,
+    Proved,
     Vertex,
     VertexProof,
     Witness,
@@ -138,11 +139,18 @@ def witness_of_certificate(
 def stored_witness(witness: Witness, names: tuple[str, str] = WITNESSES) -> dict[str, FloatArray]:
     """Return the matrices of a certificate from which `witness_of_certificate` makes a witness again."""
     stored = {names[0]: np.array(witness.P)}
+    if witness.slopes is not None:
+        stored[slope_name(names)] = witness.slopes
     return stored if witness.G is None else {**stored, names[1]: np.array(witness.G)}
 
 
+def slope_name(names: tuple[str, str]) -> str:
+    """Return the name of the multipliers of slopes beside Lyapunov matrices of these names."""
+    return f"T{names[0].removeprefix('P')}"
+
+
 def region_gain_row(
-    name: str, claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float, *, discrete: bool
+    name: str, claim: str, vertices: Proved, witness: Witness | None, level: float, *, discrete: bool
 ) -> Check:
     """Return the row that a gain over the region is below ``level``, with words of its own."""
     sound = witness is not None and np.isfinite(level) and level > 0.0
@@ -160,7 +168,7 @@ def rated_gain_row(
 
 
 def deviation_row(
-    claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float, *, discrete: bool = False
+    claim: str, vertices: Proved, witness: Witness | None, level: float, *, discrete: bool = False
 ) -> Check:
     """Return the row that the root mean square of errors is below ``level``."""
     sound = witness is not None and np.isfinite(level) and level > 0.0
@@ -242,7 +250,7 @@ def _gain_along(closed: Sequence[tuple[FloatArray, ...]], course: Sequence[int])
     return float(np.linalg.norm(whole, 2)) if whole.size else 0.0
 
 
-def decay_row(vertices: Sequence[Vertex], witness: Witness | None, rate: float, *, discrete: bool, words: str) -> Check:
+def decay_row(vertices: Proved, witness: Witness | None, rate: float, *, discrete: bool, words: str) -> Check:
     """Return the row that errors decay."""
     sound = witness is not None and (0.0 <= rate < 1.0 if discrete else rate > 0.0)
     proof = prove_decay(vertices, witness, rate, discrete=discrete) if sound and witness else _no_certificate()

@@ -21,8 +21,10 @@ from obsynth.plants.operating_region import OperatingRegion, Slope
 from obsynth.plants.signal_names import leading_names
 from obsynth.plants.transformations.nonlinear_terms import ARGUMENT, NonlinearTerms, nonlinear_terms
 
-#: Slopes over whose corners a proof is made one by one: 2 ** 12 = 4096.
-MOST_SLOPES = 12
+#: Slopes whose corners are looked at one by one: 2 ** 12 = 4096.
+MOST_CORNER_SLOPES = 12
+#: Slopes of one block: with the errors, and what drives them, matrices of order 128 are proved.
+MOST_SLOPES = 64
 _SOURCE = "observer over a region"
 
 
@@ -73,15 +75,15 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         of_the_method=True,
     )  # fmt: skip
     yield Condition(
-        "corners", "the slopes have no more corners than can be proved one by one", len(slopes) <= MOST_SLOPES,
-        float(len(slopes)), float(MOST_SLOPES), _SOURCE,
+        "corners", "the slopes are no more than can be proved: at their corners, or in one block",
+        len(slopes) <= MOST_SLOPES, float(len(slopes)), float(MOST_SLOPES), _SOURCE,
         "" if len(slopes) <= MOST_SLOPES else
-        f"{len(slopes)} slopes have 2 ** {len(slopes)} corners: write products of one argument as one function of it, "
-        "or linearise what hardly bends",
+        f"{len(slopes)} slopes: write products of one argument as one function of it, or linearise what hardly bends",
     )  # fmt: skip
     if len(slopes) <= MOST_SLOPES:
         bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
-        if terms.differential < len(terms.names):
+        # Of more slopes the block that is proved holds the algebraic equations, too.
+        if terms.differential < len(terms.names) and len(slopes) <= MOST_CORNER_SLOPES:
             yield _algebraic_states(terms, slopes, bounds)
         middle = bounds.mean(axis=1)
         yield _detectable(terms, slopes, middle, "in the middle", "with slopes in the middle of their bounds")

@@ -128,7 +128,7 @@ def certified(
     if level is None and least < NEGLIGIBLE[0] * size:
         levels = [share * size for share in NEGLIGIBLE]
     for target in dict.fromkeys(levels):
-        z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else _power_of_two(target)
+        z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else power_of_two(target)
         moved = units.moved(z_unit)
         problem = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
         if not has_numbers(problem, solver, settings, runs):
@@ -292,7 +292,7 @@ def _least(
         for z, b, d in zip(plain.Cz, plain.B, plain.Dz, strict=True)
     ]
     size = float(max(sizes))
-    unit, known = _power_of_two(size) if size > 0.0 else 1.0, None
+    unit, known = power_of_two(size) if size > 0.0 else 1.0, None
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
         problem = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
@@ -313,11 +313,11 @@ def _least(
         if level < NEGLIGIBLE[0] * size:
             return level, unit, size
         known = level, unit, size
-        unit *= _power_of_two(least)
+        unit *= power_of_two(least)
     return level, unit, size
 
 
-def _power_of_two(value: float) -> float:
+def power_of_two(value: float) -> float:
     """Return the power of two that is nearest by ratio."""
     return float(np.exp2(np.round(np.log2(value))))
 

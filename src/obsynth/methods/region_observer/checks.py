@@ -17,7 +17,7 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.operating_region import OperatingRegion
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.vertex_inequalities import Vertex, Witness, prove_decay
+from obsynth.proofs.vertex_inequalities import Proved, Vertex, Witness, prove_decay
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed, listed_gains
@@ -32,6 +32,7 @@ from obsynth.verification.over_region import (
     deviation_row,
     region_gain_row,
     rows_of_euler,
+    slope_name,
 )
 from obsynth.verification.plant import condition_rows
 
@@ -136,7 +137,8 @@ def _witness(design: ObserverDesign, terms: NonlinearTerms, names: tuple[str, st
     shape = (1, len(terms.names), len(terms.names))
     if P is None or G is None or P.shape != shape or G.shape != shape:
         return None
-    return Witness(list(P), list(G), differential=terms.differential)
+    slopes = design.certificate.matrices.get(slope_name(names))
+    return Witness(list(P), list(G), differential=terms.differential, slopes=slopes)
 
 
 def _proved_rows(
@@ -165,7 +167,7 @@ def _proved_rows(
             of_level,
             level,
         )
-        if len(vertices) <= _MOST_COMPARED:
+        if isinstance(vertices, list) and len(vertices) <= _MOST_COMPARED:
             frozen = max(_frozen_deviation(vertex, terms.differential) for vertex in vertices)
             yield information(
                 FROZEN_ROW,
@@ -193,7 +195,7 @@ def _proved_rows(
     )
 
 
-def _index_row(vertices: list[Vertex], witness: Witness | None, algebraic: tuple[str, ...]) -> Check:
+def _index_row(vertices: Proved, witness: Witness | None, algebraic: tuple[str, ...]) -> Check:
     """Return the row that the algebraic equations have one solution everywhere in the region."""
     proof = None if witness is None else prove_decay(vertices, witness, 0.0, discrete=False)
     holds = proof is not None and proof.proved

@@ -18,6 +18,7 @@ from obsynth.verification.over_region import (
     GAIN_WITNESSES,
     REGION_GAIN_ROW,
     WITNESSES,
+    slope_name,
 )
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ class RegionObserverMethod(Method):
     A copy of the plant with one gain.  While the plant stays in the region, whatever its trajectory, errors decay at
     least at the proved rate, and the estimates deviate by less than is proved; the estimate may start anywhere.  The
     slopes of all nonlinearities are enclosed over the region from the texts of the equations, and the inequalities are
-    proved at every corner of these slopes.
+    proved at every corner of these slopes; of more than 12 slopes one inequality with a multiplier for each is proved,
+    which is sufficient only.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ class RegionObserverMethod(Method):
         An option is missing or malformed, or the equations are Python functions.
     PreconditionError
         A slope is not bounded over the region, a formula jumps, E would change with the state, derivatives are
-        dependent, or there are more than 12 slopes.
+        dependent, or there are more than 64 slopes.
     SolverError
         No certificate was found: inconclusive.
     VerificationError
@@ -126,7 +128,9 @@ class RegionObserverMethod(Method):
         ),
         "region_gain": ClaimMeaning("", "L2 gain from the noises to the errors that count", REGION_GAIN_ROW),
     }
-    witnesses: ClassVar[frozenset[str]] = frozenset({*WITNESSES, *GAIN_WITNESSES})
+    witnesses: ClassVar[frozenset[str]] = frozenset(
+        {*WITNESSES, *GAIN_WITNESSES, slope_name(WITNESSES), slope_name(GAIN_WITNESSES)}
+    )
     purposes: ClassVar[frozenset[Purpose]] = frozenset()
     placeholders: ClassVar[Mapping[str, Any]] = {"sample_time": 1.0, "goal": "decay"}
 

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES
 from obsynth.conditions.lmi import chosen_solver
+from obsynth.conditions.slope_multipliers import SlopedErrors
 from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.slope_certificates import best_decay_of_slopes, certified_slopes
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
 from obsynth.methods.region_observer.method import RegionObserverMethod
@@ -27,7 +30,14 @@ from obsynth.proofs.vertex_inequalities import Witness, prove_decay, prove_gain,
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.nonlinear_drive import drive_of, wanted_of
-from obsynth.verification.nonlinear_region import corner_errors, corners_of, directions, fastest_decay, whole_gain
+from obsynth.verification.nonlinear_region import (
+    corner_errors,
+    corners_of,
+    directions,
+    fastest_decay,
+    middle_and_half,
+    whole_gain,
+)
 from obsynth.verification.over_region import GAIN_WITNESSES, rows_of_euler, stored_witness
 
 #: Bounds of slopes are stored a little wider: on another processor elementary functions may differ in the last digit.
@@ -56,7 +66,7 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
     bounds = _stored_bounds(slopes)
     drive = _drive(terms, region, asked, step)
     given_gain = _given_gain(terms, asked.gains)
-    progress("solving the inequalities at the corners of the slopes")
+    progress("solving the inequalities for the slopes")
     problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
     solution = problem.solved(asked, given_gain, solver)
     progress("proving the shipped numbers")
@@ -114,11 +124,12 @@ def _nominal(plant: DAEModel, faults: tuple[str, ...]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _Solution:
     """A gain with its Lyapunov matrices in the plant's units."""
 
     gain: FloatArray
     witness: Witness
+    of_decay: Witness
     level: float | None
     runs: tuple[Mapping[str, Any], ...]
 
@@ -127,7 +138,7 @@ class _Found:
 class _Scaled:
     """The error system at the corners in units in which it is near one: states, equations, outputs and time."""
 
-    errors: ErrorPolytope
+    errors: ErrorPolytope | SlopedErrors
     states: FloatArray
     rows: FloatArray  # of algebraic equations
     outputs: FloatArray
@@ -144,19 +155,22 @@ class _Scaled:
         drive: tuple[FloatArray, FloatArray, FloatArray],
         goal: str,
     ) -> _Scaled:
-        """Return the error system at every corner."""
+        """Return the error system at every corner; of more slopes than have corners that of the middle, with them."""
         W, Wy, V = directions(terms, slopes)
         nd = terms.differential
-        corners = corners_of(bounds)
-        A = [terms.A + W @ np.diag(corner) @ V for corner in corners]
-        C = [terms.C + Wy @ np.diag(corner) @ V for corner in corners]
+        few = len(slopes) <= MOST_CORNER_SLOPES
+        middle, half = middle_and_half(bounds)
+        places = corners_of(bounds) if few else [middle]
+        A = [terms.A + W @ np.diag(place) @ V for place in places]
+        C = [terms.C + Wy @ np.diag(place) @ V for place in places]
+        beside = (0.0, 0.0) if few else (np.abs(W) @ np.diag(half) @ np.abs(V), np.abs(Wy) @ np.diag(half) @ np.abs(V))
         B, D, Cz = drive
         states = _powers(_errors_of_kalman(np.mean(A, axis=0), np.mean(C, axis=0), B, D, nd, _sizes(terms, region)))
-        largest = np.max(np.abs(A), axis=0) * states
-        time = 1.0 / _power(float(np.max(largest[:nd] / states[:nd, None], initial=0.0)) or 1.0)
+        largest = np.max(np.abs(A), axis=0) + beside[0]
+        time = 1.0 / _power(float(np.max((largest * states)[:nd] / states[:nd, None], initial=0.0)) or 1.0)
         noisy = np.sqrt(time) if goal == "power" else 1.0
-        rows = 1.0 / _powers(np.max(np.max(np.abs(A), axis=0)[nd:] * states, axis=1, initial=0.0))
-        sizes = np.max(np.max(np.abs(C), axis=0) * states, axis=1, initial=0.0)
+        rows = 1.0 / _powers(np.max(largest[nd:] * states, axis=1, initial=0.0))
+        sizes = np.max((np.max(np.abs(C), axis=0) + beside[1]) * states, axis=1, initial=0.0)
         outputs = 1.0 / _powers(sizes)
         left = np.concatenate([time / states[:nd], rows])[:, None]
         errors = ErrorPolytope(
@@ -168,36 +182,49 @@ class _Scaled:
             dt=0.0,
             differential=nd if nd < len(states) else None,
         )
-        return cls(errors, states, rows, outputs, time, nd)
+        sloped = SlopedErrors(errors, left * W * half, outputs[:, None] * Wy * half, V * states)
+        return cls(errors if few else sloped, states, rows, outputs, time, nd)
 
-    def solved(self, asked: RegionObserverMethod, given: FloatArray | None, solver: str) -> _Found:
+    def solved(self, asked: RegionObserverMethod, given: FloatArray | None, solver: str) -> _Solution:
         """Return a gain with its certificate."""
-        gains = None if given is None else [self._gain_in(given)]
+        own = None if given is None else self._gain_in(given)
         decay = None if not asked.decay else asked.decay * self.time
         if asked.goal == "decay":
             if decay is not None:
                 raise SpecError("goal: decay finds the fastest decay: leave decay out.", path="decay")
-            _, witness, own = best_decay(self.errors, gains=gains, gain="constant", limit=DECAY_LIMIT)
-            return _Found(self._gain_out(own[0], given), self._witness_out(witness), None, ())
-        made = certified(
-            self.errors,
-            goal=asked.goal,
-            margin=DESIGN_MARGIN if given is None else 0.0,
-            decay=decay,
-            gain="constant",
-            gains=gains,
-            solver=solver,
-            settings=asked.solver_options,
-        )
-        return _Found(self._gain_out(made.gains[0], given), self._witness_out(made.witness), made.level, made.runs)
+            witness, gain = self._fastest(own)
+            outside = self._witness_out(witness)
+            return _Solution(self._gain_out(gain, given), outside, outside, None, ())
+        options: dict[str, Any] = {
+            "goal": asked.goal,
+            "margin": DESIGN_MARGIN if given is None else 0.0,
+            "decay": decay,
+            "solver": solver,
+            "settings": asked.solver_options,
+        }
+        if isinstance(self.errors, SlopedErrors):
+            block = certified_slopes(self.errors, gain=own, **options)
+            of_level, of_decay = self._witness_out(block.witness), self._witness_out(block.of_decay)
+            return _Solution(self._gain_out(block.gain, given), of_level, of_decay, block.level, block.runs)
+        made = certified(self.errors, gain="constant", gains=None if own is None else [own], **options)
+        witness = self._witness_out(made.witness)
+        return _Solution(self._gain_out(made.gains[0], given), witness, witness, made.level, made.runs)
 
     def decay_of(self, gain: FloatArray) -> Witness | None:
-        """Return Lyapunov matrices of the fastest decay of a gain; ``None`` where none were found."""
+        """Return Lyapunov matrices of the fastest decay of a gain; ``None`` where the search has no result."""
         try:
-            _, witness, _ = best_decay(self.errors, gains=[self._gain_in(gain)], gain="constant", limit=DECAY_LIMIT)
+            return self._witness_out(self._fastest(self._gain_in(gain))[0])
         except SolverError:
             return None
-        return self._witness_out(witness)
+
+    def _fastest(self, gain: FloatArray | None) -> tuple[Witness, FloatArray]:
+        """Return Lyapunov matrices of the fastest decay, of a gain or of the best one, and the gain."""
+        if isinstance(self.errors, SlopedErrors):
+            _, witness, best = best_decay_of_slopes(self.errors, gain=gain, limit=DECAY_LIMIT)
+            return witness, best
+        gains = None if gain is None else [gain]
+        _, witness, own = best_decay(self.errors, gains=gains, gain="constant", limit=DECAY_LIMIT)
+        return witness, own[0]
 
     def _gain_in(self, gain: FloatArray) -> FloatArray:
         scaled = gain * self.time / self.states[: self.differential, None] / self.outputs
@@ -220,7 +247,8 @@ class _Scaled:
         G = (G.T / s[:, None] * columns).T
         G[:nd, :nd] = P[:nd, :nd]
         G[:nd, nd:] = 0.0
-        return Witness([P], [G], differential=nd)
+        # A multiplier stands between errors in the same units: V e and what the slopes make of it.
+        return Witness([P], [G], differential=nd, slopes=witness.slopes)
 
 
 def _errors_of_kalman(
@@ -270,17 +298,17 @@ def _proved(
     slopes: tuple[Slope, ...],
     bounds: FloatArray,
     drive: tuple[FloatArray, FloatArray, FloatArray],
-    found: _Found,
+    solution: _Solution,
     asked: RegionObserverMethod,
     problem: _Scaled,
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return what the shipped numbers prove: the decay and the level, each with Lyapunov matrices of its own."""
-    vertices = corner_errors(terms, slopes, bounds, found.gain, drive)
+    vertices = corner_errors(terms, slopes, bounds, solution.gain, drive)
     wanted = asked.decay or 0.0
-    witness = problem.decay_of(found.gain) or found.witness
-    rate = fastest_decay(vertices, witness, _fastest(terms, found.gain))
-    if rate < wanted and prove_decay(vertices, found.witness, wanted, discrete=False).proved:
-        rate, witness = wanted, found.witness
+    witness = problem.decay_of(solution.gain) or solution.of_decay
+    rate = fastest_decay(vertices, witness, _fastest(terms, solution.gain))
+    if rate < wanted and prove_decay(vertices, solution.of_decay, wanted, discrete=False).proved:
+        rate, witness = wanted, solution.of_decay
     matrices = stored_witness(witness)
     if rate <= 0.0 or rate < wanted:
         raise SolverError(
@@ -288,13 +316,13 @@ def _proved(
             "that there is none: give a smaller region, or a smaller decay."
         )
     claims = {"region_decay": rate}
-    if found.level is None:
+    if solution.level is None:
         return claims, matrices
-    matrices |= stored_witness(found.witness, GAIN_WITNESSES)
+    matrices |= stored_witness(solution.witness, GAIN_WITNESSES)
     prover, name = (prove_mean_square, "region_deviation") if asked.goal == "power" else (prove_gain, "region_gain")
     for room in PROOF_ROOMS:
-        level = found.level * (1.0 + room)
-        if prover(vertices, found.witness, level, discrete=False).proved:
+        level = solution.level * (1.0 + room)
+        if prover(vertices, solution.witness, level, discrete=False).proved:
             return {**claims, name: level}, matrices
     raise SolverError(
         "A gain was found, but its certificate could not be proved for the shipped numbers. That is no proof that "
@@ -314,8 +342,14 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
     assumed = [
         each.text for place, each in enumerate(region.ranges) if place not in measured and bool(states[place].any())
     ]
+    count = len(observer.slopes)
+    kind = (
+        f"at {2**count} corners of {count} slopes"
+        if count <= MOST_CORNER_SLOPES
+        else f"in one block with a multiplier for each of {count} slopes (sufficient: a tighter claim may be true)"
+    )
     notes = [
-        f"One certificate at {2 ** len(observer.slopes)} corners of {len(observer.slopes)} slopes, for the region "
+        f"One certificate {kind}, for the region "
         f"{region.sentence()}. A row in which an input, a measurement or an estimate leaves it is out: nothing is "
         f"claimed for {observer.forgetting} rows from the last such row on."
     ]
