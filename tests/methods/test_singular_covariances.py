@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth import DescriptorSystem, ObserverDesign
+from obsynth import DescriptorSystem, ObserverDesign, TimeVaryingDescriptorSystem
 from obsynth.methods.engines.recursive.checks import BATCH_TOLERANCE
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.plants.sequences import MatrixSequence
 
 TURN = [[0.9, 0.1], [-0.2, 0.7]]
@@ -59,6 +61,76 @@ def test_no_stable_plant_is_refused_for_noise_that_is_missing(first: int, share:
         # Half of them for each plant, the others for the next.
         for Q, R in share(noises[seed % 2 :] + noises[: seed % 2], 2):
             assert obsynth.descriptor_kalman(sampled(A, C), Q=Q, R=R).report.passed, seed
+
+
+def known_exactly(seed: int) -> tuple[DescriptorSystem, np.ndarray, np.ndarray]:
+    """A stable plant whose states a perfect sensor determines: with less process noise than states, or none."""
+    rng = np.random.default_rng(1000 + seed)
+    n, ny = int(rng.integers(2, 6)), int(rng.integers(1, 4))
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.3, 0.95) / max(abs(np.linalg.eigvals(A)))
+    C, root = rng.standard_normal((ny, n)), rng.standard_normal((n, 1))
+    variances = np.full(ny, 0.01)
+    variances[: int(rng.integers(1, ny + 1))] = 0.0
+    return sampled(A, C), (root @ root.T if seed % 2 else np.zeros((n, n))), np.diag(variances)
+
+
+#: Plants of which rounding was taken for noise: each failed a check, or had gains without a steady state.
+ROUNDED = (45, 50, 75, 85)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("seed", ROUNDED)
+def test_rounding_of_a_state_that_is_known_exactly_is_no_noise(seed: int) -> None:
+    plant, Q, R = known_exactly(seed)
+    design = obsynth.descriptor_kalman(plant, Q=Q, R=R)
+    assert design.report.passed
+    L = design.gains["L"]
+    assert max(abs(np.linalg.eigvals(L @ plant.A))) < 1.0
+    if not Q.any():
+        # What is known exactly has the variance zero, not one of 1e-32.
+        *_, last = gain_steps(design.observer, plant.nx + 1)
+        assert not last.factor.any()
+
+
+def test_a_steady_state_that_is_known_exactly_has_gains_by_which_errors_of_rounding_decay() -> None:
+    plant, Q, R = known_exactly(50)
+    steady = obsynth.steady_state_filter(plant, Q=Q, R=R)
+    assert not steady.P.any()
+    assert max(abs(np.linalg.eigvals(steady.L @ plant.A))) < 1.0
+
+
+@pytest.mark.parametrize("seed", [45, 50])
+def test_errors_of_rounding_decay_where_outputs_without_noise_show_them(seed: int) -> None:
+    """An estimate that is off by what rounding makes of it comes back, also of a plant that varies."""
+    plant, Q, R = known_exactly(seed)
+    varying = TimeVaryingDescriptorSystem(
+        None, MatrixSequence.of([plant.A] * 80, "A"), None, plant.C, dt=1.0, horizon=80
+    )
+    design = obsynth.descriptor_kalman(varying, Q=Q, R=R)
+    assert design.report.passed
+    x, records = np.ones(plant.nx), []
+    for _ in range(80):
+        records.append(plant.C @ x)
+        x = plant.A @ x
+    observer = design.observer
+    state = observer.init()
+    for k in range(80):
+        state, row = observer.advance(state, records[k], np.zeros(0))
+        if k == 20:
+            state = state._replace(x=state.x * (1.0 + 1e-12))
+    start = np.linalg.norm(plant.A) * np.ones(plant.nx)
+    assert np.all(np.abs(row.x - np.linalg.matrix_power(plant.A, 79) @ np.ones(plant.nx)) <= 1e-12 * start)
+
+
+def test_a_singular_covariance_has_no_deviation_of_rounding() -> None:
+    """The root of an eigenvalue of 1e-17 would be a deviation of 3e-9."""
+    rng = np.random.default_rng(5)
+    for n in range(2, 7):
+        root = rng.standard_normal((n, 1))
+        factor = covariance_factor(root @ root.T, "Q")
+        assert np.count_nonzero(factor.any(axis=0)) == 1
+        np.testing.assert_allclose(factor @ factor.T, root @ root.T, rtol=0, atol=1e-14 * np.max(root**2))
 
 
 def failed(design: ObserverDesign, **changes) -> set[str]:

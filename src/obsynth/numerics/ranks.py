@@ -66,6 +66,10 @@ SYMMETRY_TOLERANCE = 1e-10
 #: An eigenvalue of a correlation matrix above minus this is a rounded zero.
 DEFINITENESS_TOLERANCE = 1e-12
 
+#: An eigenvalue of a correlation matrix below this share of the largest, for each of its rows, is zero: entries are
+#: rounded by half of it, of two digits of a product that was rounded once, and so is the decomposition.
+ROUNDED_EIGENVALUE = 4.0 * float(np.finfo(np.float64).eps)
+
 #: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8
 
@@ -291,16 +295,21 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
         )
     scale = np.where(deviations > 0.0, deviations, 1.0)
     correlation = 0.5 * (covariance + covariance.T) / np.outer(scale, scale)
+    rounding = ROUNDED_EIGENVALUE * len(correlation)
     try:
-        return np.asarray(deviations[:, None] * np.linalg.cholesky(correlation + np.diag(1.0 * (deviations == 0.0))))
+        factor = np.linalg.cholesky(correlation + np.diag(1.0 * (deviations == 0.0)))
+        if np.min(np.diagonal(factor)) ** 2 > rounding:
+            return np.asarray(deviations[:, None] * factor)
     except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(correlation)
+        pass
+    values, vectors = np.linalg.eigh(correlation)
     if values[0] < -DEFINITENESS_TOLERANCE * len(values):
         raise SpecError(
             f"{name} is not positive semidefinite: its correlation matrix has the eigenvalue {values[0]:.3g}.",
             path=name,
         )
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    # The root of a rounding error of 1e-16 would be a deviation of 1e-8 in a direction that has none.
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.where(values > rounding * values[-1], values, 0.0)))
 
 
 def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:

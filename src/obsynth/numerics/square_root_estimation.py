@@ -50,6 +50,9 @@ WORK = 64
 CONSISTENCY = 1e-9
 
 
+#: Combinations of data without noise in which outputs have less than this share are of equations alone.
+SENSOR_SHARE = RANK_TOLERANCE
+
 #: A direction is discounted only where new data bring at least this share of what forgetting takes away.
 WORTH_FORGETTING = 0.1
 
@@ -57,13 +60,27 @@ WORTH_FORGETTING = 0.1
 class LeastSquaresStep(NamedTuple):
     """``estimate (n, columns)``, ``P = factor factor'``, the whitened parity ``innovation (m, columns)``, and
 
-    ``diffuse (n, r)``: directions of x about which nothing is known, none unless samples are missing.
+    ``diffuse (n, r)``: directions of x about which nothing is known, none unless samples are missing; ``rounding (n,
+    any)``: a root of what rounding makes of x, without columns unless outputs without noise are redundant.
     """
 
     estimate: FloatArray
     factor: FloatArray
     innovation: FloatArray
     diffuse: FloatArray
+    rounding: FloatArray = np.zeros((0, 0))
+
+
+class Rounding(NamedTuple):
+    """What no stated noise explains in the data of a step: ``root (rows, any)``, in units that are free."""
+
+    root: FloatArray
+    measured: NDArray[np.bool_]  # ``(rows,)``: which rows are outputs
+    is_followed: bool  # whether it was needed before
+
+    def of(self, received: NDArray[np.bool_]) -> Rounding:
+        """Return the same of some rows ``(rows,)``."""
+        return self._replace(root=self.root[received], measured=self.measured[received])
 
 
 class Projection(NamedTuple):
@@ -148,37 +165,90 @@ def projected_step(
     return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.empty((n, 0)))
 
 
+def directions_of(noise: FloatArray) -> int:
+    """Return how many columns of a square root ``(rows, any)`` are not zero: its noise has no more directions.
+
+    Each parity that is whitened takes one of them.  Where they are fewer than the rows of a step, fewer than all states
+    keep a variance after it; a triangle of the size of all rows would fill the others with its rounding, which the next
+    step would take for noise."""
+    return int(np.count_nonzero(noise.any(axis=0)))
+
+
 def least_squares_step(
     H: FloatArray, S: FloatArray, Y: FloatArray, *, least: float = DEPENDENT_COLUMN
 ) -> LeastSquaresStep | None:
-    """Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
+    """Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided: of H, of the parity, or of
+    noise in fewer directions than there are rows.
 
     With ``H = [Q_1 Q_2] [R_H; 0]`` and ``[Q_2'; Q_1'] S = [L 0; X T] Z'``: ``v = L^-1 Q_2' Y``, ``x = R_H^-1 (Q_1' Y -
     X v)`` and ``P = R_H^-1 T T' R_H^-T``.
     """
-    projection = projection_of(H, least=least)
+    projection = projection_of(H, least=least) if directions_of(S) >= len(H) else None
     if projection is None:
         return None
     return projected_step(projection, (projection.rotation @ S).T, projection.rotation @ Y)
 
 
 def rank_revealing_step(
-    H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray, *, mapped: int = 0
+    H: FloatArray,
+    S: FloatArray,
+    Y: FloatArray,
+    unknown: FloatArray,
+    *,
+    mapped: int = 0,
+    rounding: Rounding | None = None,
 ) -> LeastSquaresStep:
-    """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``."""
-    n = H.shape[1]
+    """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``.
+
+    The factor has no more columns that are not zero than noise has directions beside those of the parity: where none is
+    left, x is known exactly, and its covariance is zero without rounding.
+
+    Then combinations of the data vanish, and any multiple of them may be added to x: stated noise does not choose.
+    With ``rounding`` that multiple is taken by which the least of it remains; without, none, and errors that rounding
+    made go on as the plant lets them."""
+    n, S = H.shape[1], S[:, S.any(axis=0)]
     lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
     rank = len(head)
-    innovation, carried, noise_left = _whitened(q1, q2, S, Y, mapped)
+    columns = Y.shape[1]
+    if rounding is not None:
+        Y = np.hstack([Y, rounding.root, np.eye(len(H))])
+    innovation, carried, noise_left, vanishing = _whitened(q1, q2, S, Y, slice(mapped, columns))
     noise = _triangle(noise_left.T)[: min(noise_left.shape)].T if noise_left.size else np.zeros((rank, 0))
     solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
     back = np.zeros((len(lengths), solved.shape[1]))
     back[independent] = solved
     back = back / lengths[:, None]
-    root, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
+    factor, diffuse = _square(back[:n, Y.shape[1] :]), _basis(null, lengths[:n])
+    estimate, innovation = back[:n, : Y.shape[1]], innovation[:, :columns]
+    if rounding is None or directions_of(factor) == n:
+        # Where every state has a variance of its own, rounding is nothing beside it.
+        return LeastSquaresStep(estimate[:, :columns], factor, innovation, diffuse, np.zeros((n, 0)))
+    chosen, remaining = _least_rounding(estimate, vanishing, columns, rounding)
+    return LeastSquaresStep(chosen, factor, innovation, diffuse, remaining)
+
+
+def _square(root: FloatArray) -> FloatArray:
+    """Return a root ``(n, n)`` of the same covariance as ``root (n, any)``, with no more columns that are not zero."""
+    n = len(root)
+    square = np.zeros((n, n))
     compact = _triangle(root.T)[:n].T if root.size else root
-    factor[:, : compact.shape[1]] = compact
-    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
+    square[:, : compact.shape[1]] = compact
+    return square
+
+
+def _least_rounding(
+    estimate: FloatArray, vanishing: FloatArray, columns: int, rounding: Rounding
+) -> tuple[FloatArray, FloatArray]:
+    """Return the estimate ``(n, columns)`` with the multiple of what vanishes that leaves the least rounding, and a
+    root of what is left; further columns of both are those of the rounding, and of the data one by one."""
+    end = columns + rounding.root.shape[1]
+    entries = np.abs(vanishing[:, end:])
+    if np.any(entries[:, rounding.measured] > SENSOR_SHARE * np.max(entries, axis=1, initial=0.0, keepdims=True)):
+        weights = -np.linalg.lstsq(vanishing[:, columns:end].T, estimate[:, columns:end].T, rcond=None)[0].T
+        estimate = estimate + weights @ vanishing
+    elif not rounding.is_followed:
+        return estimate[:, :columns], np.zeros((len(estimate), 0))
+    return estimate[:, :columns], _square(estimate[:, columns:end])
 
 
 def _by_columns(
@@ -253,12 +323,13 @@ def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
 
 
 def _whitened(
-    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, mapped: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the whitened parity of Y, what it tells about the rest, and the noise that is left in the rest."""
+    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, checked: slice
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the whitened parity of Y, what it tells about the rest, the noise that is left in the rest, and what is
+    free of noise: of the ``checked`` columns, which are data, it must vanish."""
     data = q2.T @ Y
     if not q2.shape[1]:
-        return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S
+        return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S, data
     sizes, z, t, order, rank = _parity(q2, S)
     scaled = (data / sizes)[order]
     lower = t[:rank, :rank].T
@@ -266,16 +337,16 @@ def _whitened(
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes)[order][rank:]
-    if mapped:
+    if checked.start:
         _require_consistent(
-            np.hstack([np.zeros((len(remainder), 1)), remainder[:, mapped:]]),
-            np.hstack([np.zeros((len(remainder), 1)), terms[:, mapped:]]),
+            np.hstack([np.zeros((len(remainder), 1)), remainder[:, checked]]),
+            np.hstack([np.zeros((len(remainder), 1)), terms[:, checked]]),
         )
     else:
-        _require_consistent(remainder, terms)
+        _require_consistent(remainder[:, checked], terms[:, checked])
     rotated = q1.T @ S @ z
     signs = np.sign(np.diagonal(lower))[:, None]
-    return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
+    return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:], remainder
 
 
 def _require_consistent(remainder: FloatArray, terms: FloatArray) -> None:
@@ -332,7 +403,8 @@ def joint_step(
     if S.shape[1] < len(H):
         S = np.hstack((S, np.zeros((len(H), len(H) - S.shape[1]))))
     least = DEPENDENT_COLUMN if complete else SUSPECT_COLUMN
-    step = None if unknown.shape[1] else _regular(H, S, known.shape[1], right, least)
+    regular = not unknown.shape[1] and directions_of(S) >= len(H)
+    step = _regular(H, S, known.shape[1], right, least) if regular else None
     return _by_rank(H, S, known.shape[1], right, unknown) if step is None else step
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import covariance_factor
-from obsynth.numerics.square_root_estimation import DEPENDENT_COLUMN, SUSPECT_PARITY
+from obsynth.numerics.square_root_estimation import DEPENDENT_COLUMN, SUSPECT_PARITY, directions_of
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.sample import RecursiveState
@@ -80,7 +80,7 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
     k = 0
     while k < samples:
         count = min(int(stretches[k]), PREPARED_STEPS)
-        if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
+        if pause or count < SHORT_STRETCH or state.diffuse.shape[1] or state.rounding.shape[1]:
             state, row = recursion.advance(state, y[k], u[k])
             _fill(
                 record,
@@ -119,8 +119,9 @@ def _kernel_steps(
     from obsynth.numerics.compiled_steps import square_root_steps
 
     first = state.k
-    stack = stacked_steps(stacked_matrices(recursion.model, first - 1, len(y)), u[:-1], y, u[1:])
-    if stack is None:
+    matrices = stacked_matrices(recursion.model, first - 1, len(y))
+    stack = stacked_steps(matrices, u[:-1], y, u[1:])
+    if stack is None or directions_of(state.factor) + _fewest_directions(matrices.noise) < stack[-1].shape[1]:
         return state
     count, rows = stack[-1].shape
     n, nx = len(state.x), recursion.settings.plant.nx
@@ -138,6 +139,11 @@ def _kernel_steps(
         innovations[:taken],
     )
     return state._replace(x=x, factor=factor, k=first + taken, u=u[taken])
+
+
+def _fewest_directions(noise: FloatArray) -> int:
+    """Return `directions_of` for the least of some steps, ``noise (1 or steps, rows, any)``."""
+    return int(np.min(np.count_nonzero(noise.any(axis=1), axis=1)))
 
 
 def stacked_steps(

@@ -16,7 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.recursion import posterior_residual
-from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
+from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, rounding_of, spreads
 
 #: Numbers of gains that are kept for a second look, of twenty megabytes.
 MOST_KEPT_GAINS = 2**21
@@ -50,7 +50,7 @@ def gain_steps(
     recursion = observer.recursion
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
-    adaptation, model = observer.adaptation, recursion.model
+    rounding, adaptation, model = start.rounding, observer.adaptation, recursion.model
     first = [step for step in (model.first(),) if step is not None]
     prepared: PreparedStep | None = None
     untaught: dict[int, tuple[FloatArray, FloatArray]] = {}  # by rows: parameters that learn nothing from them
@@ -60,22 +60,24 @@ def gain_steps(
         right = np.hstack([np.eye(rows), np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])]) if nq else None
         complete = received is None or not k or bool(received[k].all())
         solved = None
-        if complete and not diffuse.shape[1]:
+        if complete and not diffuse.shape[1] and not rounding.shape[1]:
             prepared = PreparedStep.of(step, prepared)
             solved = prepared.taken(factor, right)
         # The literal form asks for the noise itself.
         if solved is None or recursion.literal:
             S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
+            errors = rounding_of(step, rounding)
             H, right = step.H, np.eye(rows) if right is None else right
             if not complete and received is not None:
                 rows_received = np.concatenate(
                     [np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)]
                 )
                 H, S, right, unknown = H[rows_received], S[rows_received], right[rows_received], unknown[rows_received]
-            if solved is None and not unknown.shape[1] and not complete:
+                errors = errors.of(rows_received)
+            if solved is None and not unknown.shape[1] and not complete and not errors.is_followed:
                 solved = least_squares_step(H, S, right)
-            solved = solved or rank_revealing_step(H, S, right, unknown, mapped=rows)
-        diffuse = solved.diffuse
+            solved = solved or rank_revealing_step(H, S, right, unknown, mapped=rows, rounding=errors)
+        diffuse, rounding = solved.diffuse, solved.rounding if len(solved.rounding) else rounding
         gain, Upsilon, factor = solved.estimate[:, :rows], solved.estimate[:, rows:], solved.factor
         parity, G = solved.innovation[:, :rows], -solved.innovation[:, rows:]
         if rows not in untaught:

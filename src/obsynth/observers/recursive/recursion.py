@@ -34,6 +34,7 @@ from obsynth.observers.recursive.step_model import (
     StepModel,
     but_rounding_of_outputs,
     right_side,
+    rounding_of,
     spreads,
     with_missing_inputs,
 )
@@ -70,6 +71,7 @@ class Recursion:
             no_refusals(settings.plant.ny),
             no_inputs(settings.plant.nu),
             None,
+            np.zeros((nx, 0)),
         )
         if adaptation is None:
             return
@@ -79,7 +81,7 @@ class Recursion:
             joint[:nx, :nx], joint[nx:, nx:] = factor, spread
             x = np.concatenate([self.first.x, adaptation.initial_parameters])
             empty = np.zeros((nx + nq, 0))
-            self.first = self.first._replace(x=x, factor=joint, Upsilon=empty, diffuse=empty)
+            self.first = self.first._replace(x=x, factor=joint, Upsilon=empty, diffuse=empty, rounding=empty)
             return
         parameters = start_of(adaptation.initial_parameters, spread)
         self.first = self.first._replace(parameters=parameters)
@@ -169,7 +171,7 @@ class Recursion:
         row = self._estimate(after, v, G, gap, y)
         k, regressors = state.k + 1, (*state.regressors, G)[-self.window :]
         # By place: `_replace` of two or three fields takes as long as a product.
-        _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused, _, _ = after
+        _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused, _, _, rounding = after
         taken = RecursiveState(
             k,
             x,
@@ -184,6 +186,7 @@ class Recursion:
             refused,
             inputs.history,
             inputs.missing,
+            rounding,
         )
         return taken, row
 
@@ -201,7 +204,8 @@ class Recursion:
         right = right_side(step, state.x, state.Upsilon, state.u, y, u)
         solved, learned = None, None
         # The product is NaN exactly if a sample is.
-        if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
+        followed = state.diffuse.shape[1] or state.rounding.shape[1]
+        if not (self.literal or followed or math.isnan(y.dot(y))):
             self._prepared = PreparedStep.of(step, self._prepared)
             solved = self._prepared.taken(state.factor, right)
         if solved is None:
@@ -241,6 +245,7 @@ class Recursion:
             state.refused,
             state.inputs,
             state.missing,
+            solved.rounding if len(solved.rounding) else state.rounding,
         )
         return after, v, G
 
@@ -251,15 +256,17 @@ class Recursion:
         Return also what the literal form learns from."""
         ne, H = len(step.A), step.H
         S, unknown = spreads(step, state.factor, state.diffuse, state.k, self.settings.state_names)
+        rounding = rounding_of(step, state.rounding)
         received = ~np.isnan(right[:, 0])
         complete = bool(received.all())
         if not complete:
             H, S, right, unknown = H[received], S[received], right[received], unknown[received]
+            rounding = rounding.of(received)
         solved = None
-        if not unknown.shape[1] and S.shape[1] >= len(S):
+        if not unknown.shape[1] and not rounding.is_followed:
             solved = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)
         if solved is None:
-            solved = rank_revealing_step(H, S, right, unknown)
+            solved = rank_revealing_step(H, S, right, unknown, rounding=rounding)
             if complete and solved.diffuse.shape[1] > unknown.shape[1]:
                 raise PreconditionError(
                     f"rank H_k is lost at k = {state.k}: the equations and outputs of that step do not determine the "

@@ -83,6 +83,7 @@ class RecursiveState(NamedTuple):
     refused: FloatArray  # ``(4, ny)``: what `no_refusals` says
     inputs: FloatArray  # ``(5, nu)``: what `no_inputs` says
     missing: FloatArray | None  # ``(nu,)``: variances of `u`, where inputs are missing
+    rounding: FloatArray  # ``(n, any)``: root of what rounding makes of `x`; without columns unless it is followed
 
 
 def deviations_in(factor: FloatArray, diffuse: FloatArray | None = None) -> FloatArray:

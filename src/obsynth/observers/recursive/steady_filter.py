@@ -18,11 +18,17 @@ from obsynth.numerics.invariant_zeros import are_outside
 from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
+from obsynth.numerics.ranks import (
+    BOUNDARY_TOLERANCE,
+    CANCELLATION_TOLERANCE,
+    NEGLIGIBLE_SHARE,
+    covariance_factor,
+    decide_rank,
+)
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.steady_observer import MOST_SETTLING_STEPS
-from obsynth.observers.recursive.step_model import stacked_noise
+from obsynth.observers.recursive.step_model import StepMatrices, rounding_of, stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
@@ -125,9 +131,11 @@ def steady_state_filter(
     E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
     noise = stacked_noise(*roots)
     P = _from_riccati(E, A, C, q, r) if decide_rank(q).full and decide_rank(r).full else None
-    if P is None or not _is_fixed(P, _step(E, A, C, noise, _root(P))[1]):
-        P = _from_recursion(E, A, C, noise)
-    gain, following = _step(E, A, C, noise, _root(P))
+    step = _Step(E, A, C, noise)
+    if P is None or not _is_fixed(P, step.taken(P)[1]):
+        P = _from_recursion(step)
+    _, following = step.taken(P)
+    gain = step.settled_gain(P)
     if not _is_fixed(P, following):
         raise SolverError("The solution of the Riccati equation (16) fails its own residual. Run the filter instead.")
     L, K = gain[:, : varying.ne], gain[:, varying.ne :]
@@ -222,44 +230,66 @@ def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r:
     return np.asarray(0.5 * (P + P.T), dtype=np.float64)
 
 
-def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray) -> FloatArray:
+def _from_recursion(step: _Step) -> FloatArray:
     """Find the fixed point of the step by Newton's method."""
 
-    P, ne = np.eye(E.shape[1]), len(E)
-    gain, following = _step(E, A, C, noise, _root(P))
+    P, A = np.eye(step.A.shape[1]), step.A
+    gain, following = step.taken(P)
     for _ in range(MOST_SETTLING_STEPS):
-        if spectral_radius(gain[:, :ne] @ A) < 1.0:
+        if spectral_radius(gain[:, : len(A)] @ A) < 1.0:
             break
         P = following
-        gain, following = _step(E, A, C, noise, _root(P))
+        gain, following = step.taken(P)
     else:
         raise SolverError(
             f"The gains of the filter are not stable after {MOST_SETTLING_STEPS} steps: its convergence is too "
             "slow for a steady state. Run the filter instead."
         )
     for _ in range(MOST_RICCATI_STEPS):
-        driven = gain @ noise
-        last, P = P, discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)
+        driven = gain @ step.noise
+        last, P = P, discrete_lyapunov(gain[:, : len(A)] @ A, driven @ driven.T)
         P = np.asarray(0.5 * (P + P.T))
-        gain, _ = _step(E, A, C, noise, _root(P))
+        gain = step.settled_gain(P)
         if np.linalg.norm(P - last) <= CANCELLATION_TOLERANCE * np.linalg.norm(P):
             break
     return P
 
 
-def _step(
-    E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray, root: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return ``[L K]`` and the covariance after one step from ``root root'``."""
-    H = np.vstack([E, C])
-    S = np.hstack([np.vstack([A @ root, np.zeros((len(C), root.shape[1]))]), noise])
-    S = np.hstack([S, np.zeros((len(H), max(len(H) - S.shape[1], 0)))])
-    data = np.eye(len(H))
-    solved = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)), mapped=len(H))
-    return solved.estimate, np.asarray(solved.factor @ solved.factor.T)
+class _Step:
+    """The step of a filter that stays the same; what rounding makes of its estimates goes on from step to step."""
+
+    def __init__(self, E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray) -> None:
+        H = np.vstack([E, C])
+        of_equations, of_outputs = np.zeros((len(A), 0)), np.zeros((len(C), 0))
+        self.matrices = StepMatrices(H, A, of_equations, of_equations, of_outputs, np.zeros((0, 0)), of_outputs, noise)
+        self.A, self.noise, self.rounding = A, noise, np.zeros((A.shape[1], 0))
+
+    def taken(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``[L K]`` and the covariance after one step from P."""
+        H, root = self.matrices.H, _root(P)
+        outputs = len(H) - len(self.A)
+        S = np.hstack([np.vstack([self.A @ root, np.zeros((outputs, root.shape[1]))]), self.noise])
+        data, unknown = np.eye(len(H)), np.zeros((len(H), 0))
+        rounding = rounding_of(self.matrices, self.rounding)
+        solved = None if rounding.is_followed else least_squares_step(H, S, data)
+        solved = solved or rank_revealing_step(H, S, data, unknown, mapped=len(H), rounding=rounding)
+        self.rounding = solved.rounding if len(solved.rounding) else self.rounding
+        return solved.estimate, np.asarray(solved.factor @ solved.factor.T)
+
+    def settled_gain(self, P: FloatArray) -> FloatArray:
+        """Return ``[L K]`` at P: of one step, or where outputs without noise leave it to rounding, after many."""
+        gain, _ = self.taken(P)
+        for _ in range(MOST_SETTLING_STEPS if self.rounding.shape[1] else 0):
+            last, (gain, _) = gain, self.taken(P)
+            if np.max(np.abs(gain - last)) <= CANCELLATION_TOLERANCE * np.max(np.abs(gain)):
+                break
+        return gain
 
 
 def _root(P: FloatArray) -> FloatArray:
-    """Return a square root of a covariance that rounding may have left slightly indefinite."""
-    values, vectors = np.linalg.eigh(P)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    """Return a square root of a covariance that rounding may have left indefinite, or definite where it is not."""
+    deviations = np.sqrt(np.maximum(np.diag(P), 0.0))
+    scale = np.where(deviations > 0.0, deviations, 1.0)
+    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
+    kept = values > NEGLIGIBLE_SHARE * values[-1]
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))

@@ -19,6 +19,8 @@ from obsynth.numerics.square_root_estimation import (
     OUTGROWN,
     LeastSquaresStep,
     Projection,
+    Rounding,
+    directions_of,
     noise_triangle,
     projected_step,
     projection_of,
@@ -76,6 +78,20 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
     noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
     noise[: len(first), : first.shape[1]], noise[len(first) :, first.shape[1] :] = first, second
     return noise
+
+
+def rounding_of(step: StepMatrices, rounding: FloatArray) -> Rounding:
+    """Return what no stated noise explains in the data of a step: what rounding made of the state before, ``rounding
+    (n, any)``, and an error of each row in units of its entries."""
+    entries = np.vstack([np.abs(step.A), np.zeros((len(step.H) - len(step.A), step.A.shape[1]))])
+    lengths = np.sqrt(np.sum(step.H**2, axis=0) + np.sum(step.A**2, axis=0))
+    sizes = np.max(np.maximum(np.abs(step.H), entries) / np.where(lengths > 0.0, lengths, 1.0), axis=1, initial=0.0)
+    root = np.zeros((len(step.H), rounding.shape[1] + len(step.H)))
+    root[: len(step.A), : rounding.shape[1]] = step.A @ rounding
+    root[:, rounding.shape[1] :] = np.diag(sizes)
+    rows = np.arange(len(step.H))
+    measured = (rows >= len(step.A)) & (rows < len(step.H) - len(step.Dn))
+    return Rounding(root, measured, bool(rounding.shape[1]))
 
 
 def spreads(
@@ -270,6 +286,7 @@ class PreparedStep:
     # The transpose of the rotated noise ``(any, rows)``, empty without a projection; of many rows its triangle.
     known: FloatArray
     sizes: FloatArray | None  # of the rows of H, see `row_sizes`
+    directions: int  # of the step's own noise, see `directions_of`
 
     @classmethod
     def of(cls, step: StepMatrices, last: PreparedStep | None) -> PreparedStep:
@@ -282,11 +299,11 @@ class PreparedStep:
         sizes = last.sizes if last is not None and same_rows else row_sizes(step.H)
         projection = projection_of(step.H, sizes=sizes) if same is None else same.projection
         if projection is None:
-            return cls(step, None, step.A[:0], step.noise[:0], sizes)
+            return cls(step, None, step.A[:0], step.noise[:0], sizes, 0)
         rotation = projection.rotation
         moved = rotation[:, : len(step.A)] @ step.A
         if same is not None and same.step.noise is step.noise:
-            return cls(step, projection, moved, same.known, sizes)
+            return cls(step, projection, moved, same.known, sizes, same.directions)
         rotated_noise = (rotation @ step.noise).T
         return cls(
             step,
@@ -294,6 +311,7 @@ class PreparedStep:
             moved,
             rotated_noise if len(rotation) < MANY_ROWS else noise_triangle(rotated_noise),
             sizes,
+            directions_of(step.noise),
         )
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
@@ -302,6 +320,8 @@ class PreparedStep:
             return None
         rotation = self.projection.rotation
         width, rotated_noise, rows = factor.shape[1], self.known, len(rotation)
+        if self.directions < rows and directions_of(factor) + self.directions < rows:
+            return None
         # `dot` is `@` with half the overhead, which for few states is most of the time.
         data = rotation if right is None else rotation.dot(right)
         if rows >= MANY_ROWS:
