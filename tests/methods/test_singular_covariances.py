@@ -93,6 +93,22 @@ def test_rounding_of_a_state_that_is_known_exactly_is_no_noise(seed: int) -> Non
         assert not last.factor.any()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("seed", [5001, 5041])
+def test_an_algebraic_equation_without_noise_does_not_contradict_an_estimate_that_satisfies_it(seed: int) -> None:
+    """Its terms cancel: what is left of them is rounding, however small the estimate is."""
+    rng = np.random.default_rng(seed)
+    n, ny = int(rng.integers(2, 5)), int(rng.integers(1, 4))
+    E, A = np.eye(n), rng.standard_normal((n, n))
+    A *= rng.uniform(0.3, 0.95) / max(abs(np.linalg.eigvals(A)))
+    C = rng.standard_normal((ny, n))
+    E[-1] = 0.0
+    A[-1, -1] += 2.0
+    plant = DescriptorSystem(E, A, C=C, dt=1.0)
+    design = obsynth.descriptor_kalman(plant, Q=0.0, R=0.0)
+    assert design.report.passed
+
+
 def test_a_steady_state_that_is_known_exactly_has_gains_by_which_errors_of_rounding_decay() -> None:
     plant, Q, R = known_exactly(50)
     steady = obsynth.steady_state_filter(plant, Q=Q, R=R)

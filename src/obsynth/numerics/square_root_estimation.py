@@ -197,6 +197,7 @@ def rank_revealing_step(
     *,
     mapped: int = 0,
     rounding: Rounding | None = None,
+    terms: FloatArray | None = None,
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``.
 
@@ -205,14 +206,17 @@ def rank_revealing_step(
 
     Then combinations of the data vanish, and any multiple of them may be added to x: stated noise does not choose.
     With ``rounding`` that multiple is taken by which the least of it remains; without, none, and errors that rounding
-    made go on as the plant lets them."""
+    made go on as the plant lets them.
+
+    ``terms`` of the same shape as Y say how large the terms are that Y is a sum of, by default Y itself: what vanishes
+    is judged beside them."""
     n, S = H.shape[1], S[:, S.any(axis=0)]
     lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
     rank = len(head)
-    columns = Y.shape[1]
+    columns, sizes = Y.shape[1], np.abs(Y) if terms is None else terms
     if rounding is not None:
         Y = np.hstack([Y, rounding.root, np.eye(len(H))])
-    innovation, carried, noise_left, vanishing = _whitened(q1, q2, S, Y, slice(mapped, columns))
+    innovation, carried, noise_left, vanishing = _whitened(q1, q2, S, Y, sizes[:, mapped:], mapped)
     noise = _triangle(noise_left.T)[: min(noise_left.shape)].T if noise_left.size else np.zeros((rank, 0))
     solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
     back = np.zeros((len(lengths), solved.shape[1]))
@@ -323,10 +327,10 @@ def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
 
 
 def _whitened(
-    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, checked: slice
+    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, terms: FloatArray, mapped: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the whitened parity of Y, what it tells about the rest, the noise that is left in the rest, and what is
-    free of noise: of the ``checked`` columns, which are data, it must vanish."""
+    free of noise: of the columns from ``mapped`` on, which are data made of such ``terms``, it must vanish."""
     data = q2.T @ Y
     if not q2.shape[1]:
         return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S, data
@@ -336,14 +340,12 @@ def _whitened(
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
-    terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes)[order][rank:]
-    if checked.start:
-        _require_consistent(
-            np.hstack([np.zeros((len(remainder), 1)), remainder[:, checked]]),
-            np.hstack([np.zeros((len(remainder), 1)), terms[:, checked]]),
-        )
-    else:
-        _require_consistent(remainder[:, checked], terms[:, checked])
+    made_of = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
+    vanishing = remainder[:, mapped : mapped + terms.shape[1]]
+    if mapped:
+        no_mean = np.zeros((len(remainder), 1))
+        vanishing, made_of = np.hstack([no_mean, vanishing]), np.hstack([no_mean, made_of])
+    _require_consistent(vanishing, made_of)
     rotated = q1.T @ S @ z
     signs = np.sign(np.diagonal(lower))[:, None]
     return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:], remainder

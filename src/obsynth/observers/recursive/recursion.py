@@ -36,6 +36,7 @@ from obsynth.observers.recursive.step_model import (
     right_side,
     rounding_of,
     spreads,
+    terms_of_right_side,
     with_missing_inputs,
 )
 from obsynth.observers.taken_inputs import TakenInputs, held_inputs, no_inputs, taken_inputs
@@ -209,7 +210,8 @@ class Recursion:
             self._prepared = PreparedStep.of(step, self._prepared)
             solved = self._prepared.taken(state.factor, right)
         if solved is None:
-            solved, learned = self._careful(state, step, but_rounding_of_outputs(right, step, y, u))
+            terms = terms_of_right_side(step, state.x, state.Upsilon, state.u, y, u)
+            solved, learned = self._careful(state, step, but_rounding_of_outputs(right, step, y, u), terms)
         v, G = solved.innovation[:, 0], -solved.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
         if nq and self.settings.adaptation is not None:
@@ -250,7 +252,7 @@ class Recursion:
         return after, v, G
 
     def _careful(
-        self, state: RecursiveState, step: StepMatrices, right: FloatArray
+        self, state: RecursiveState, step: StepMatrices, right: FloatArray, terms: FloatArray
     ) -> tuple[LeastSquaresStep, tuple[FloatArray, FloatArray, FloatArray] | None]:
         """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form.
         Return also what the literal form learns from."""
@@ -261,12 +263,12 @@ class Recursion:
         complete = bool(received.all())
         if not complete:
             H, S, right, unknown = H[received], S[received], right[received], unknown[received]
-            rounding = rounding.of(received)
+            rounding, terms = rounding.of(received), terms[received]
         solved = None
         if not unknown.shape[1] and not rounding.is_followed:
             solved = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)
         if solved is None:
-            solved = rank_revealing_step(H, S, right, unknown, rounding=rounding)
+            solved = rank_revealing_step(H, S, right, unknown, rounding=rounding, terms=terms)
             if complete and solved.diffuse.shape[1] > unknown.shape[1]:
                 raise PreconditionError(
                     f"rank H_k is lost at k = {state.k}: the equations and outputs of that step do not determine the "

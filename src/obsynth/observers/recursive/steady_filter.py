@@ -24,6 +24,7 @@ from obsynth.numerics.ranks import (
     NEGLIGIBLE_SHARE,
     covariance_factor,
     decide_rank,
+    product_but_rounding,
 )
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -246,7 +247,7 @@ def _from_recursion(step: _Step) -> FloatArray:
             "slow for a steady state. Run the filter instead."
         )
     for _ in range(MOST_RICCATI_STEPS):
-        driven = gain @ step.noise
+        driven = product_but_rounding(gain, step.noise)
         last, P = P, discrete_lyapunov(gain[:, : len(A)] @ A, driven @ driven.T)
         P = np.asarray(0.5 * (P + P.T))
         gain = step.settled_gain(P)

@@ -73,6 +73,15 @@ def but_rounding_of_outputs(right: FloatArray, step: StepMatrices, y: FloatArray
     return cleared
 
 
+def terms_of_right_side(
+    step: StepMatrices, x: FloatArray, Upsilon: FloatArray, before: FloatArray, y: FloatArray, u: FloatArray
+) -> FloatArray:
+    """Return how large the terms are that `right_side` adds, ``(rows, 1 + nq)``: an equation without noise is zero of
+    an estimate that satisfies it, but for their rounding."""
+    sizes = StepMatrices(*map(np.abs, step))._replace(D=-np.abs(step.D), Psi=-np.abs(step.Psi))
+    return right_side(sizes, *map(np.abs, (x, Upsilon, before, y, u)))
+
+
 def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the block-diagonal square root of two independent noises."""
     noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
