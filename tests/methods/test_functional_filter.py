@@ -408,3 +408,22 @@ def test_any_decay_of_a_sampled_plant_without_other_noise_has_a_gain(decay: floa
     found = obsynth.functional_filter(plant, decay=decay)
     assert found.report.passed
     assert found.certificate.claims["decay"] >= decay
+
+
+@pytest.mark.parametrize(
+    ("order", "pole", "link", "read", "moved"),
+    [
+        (15, -0.0273, 0.1506, [0, 11], 0),
+        (15, -0.0049, 0.0215, [0, 6, 9, 13], 7),
+        pytest.param(39, -0.3867, 0.0219, [0, 8, 24, 37], 1, marks=pytest.mark.long),
+    ],
+)
+def test_a_long_chain_in_continuous_time_has_a_filter(
+    order: int, pole: float, link: float, read: list[int], moved: int
+) -> None:
+    """Rows of the decoupled chain are decades apart in size, and so are the states of its filter."""
+    a = pole * np.eye(order) + link * np.eye(order, k=1)
+    plant = obsynth.DescriptorSystem(A=a, C=np.eye(order)[read], Bf=np.eye(order)[:, [moved]])
+    design = obsynth.functional_filter(plant)
+    assert design.report.passed
+    assert design.report["constant fault"].value < 1e-6

@@ -12,6 +12,7 @@ from obsynth.numerics import matrix_equations
 from obsynth.numerics.matrix_equations import (
     continuous_lyapunov,
     continuous_riccati,
+    continuous_solution,
     discrete_lyapunov,
     discrete_riccati,
 )
@@ -74,3 +75,16 @@ def test_nothing_else_calls_the_library() -> None:
     calls = re.compile(r"solve_(continuous|discrete)_(lyapunov|are)")
     found = {file.name for file in SOURCE.rglob("*.py") if calls.search(file.read_text(encoding="utf-8"))}
     assert found == {"matrix_equations.py"}
+
+
+@pytest.mark.parametrize("decades", [2.0, 9.0, 12.0])
+def test_units_of_the_outputs_change_no_covariance(decades: float) -> None:
+    """A weight over decades is no singular one: it only has rows in several units."""
+    rng = np.random.default_rng(52)
+    a, c, process = rng.normal(size=(4, 4)), rng.normal(size=(3, 4)), np.eye(4)
+    cross = 0.1 * rng.normal(size=(4, 3))
+    expected = continuous_solution(a, c, process, np.eye(3), cross)
+    units = 10.0 ** np.array([-decades, 0.0, decades])
+    found = continuous_solution(a, units[:, None] * c, process, np.diag(units**2), cross * units)
+    assert expected is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

@@ -126,3 +126,17 @@ def test_a_long_window_is_not_refused_for_rounding_of_its_delays() -> None:
     row = next(row for row in design.report.checks if row.name == "constant fault")
     assert row.passed
     assert row.value < 1e-9
+
+
+@pytest.mark.parametrize("decades", [10.0, 25.0])
+def test_units_of_the_states_change_no_bound(decades: float) -> None:
+    """States of long chains are decades apart: what rounding adds is a share of each, in whatever unit."""
+    observer, y = observer_of(3, order=12)
+    unit = np.ldexp(1.0, np.round(np.linspace(-decades, decades, 12) * np.log2(10.0)).astype(int))
+    scaled = dataclasses.replace(
+        observer, Az=unit[:, None] * observer.Az / unit, By=unit[:, None] * observer.By, Cz=observer.Cz / unit
+    )
+    plain, other = (
+        rounding_in_operation(one, np.arange(12), np.abs(y), np.abs(settled(one, y))) for one in (observer, scaled)
+    )
+    assert np.all(other <= 1.5 * plain)

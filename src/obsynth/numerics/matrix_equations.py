@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import scipy
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.scaling import power_of_two_below
 
 #: Process noise is taken to be at least this much, relative to the squared norm of A or one.
 LEAST_PROCESS = 1e-8
@@ -153,6 +154,12 @@ def continuous_solution(
 ) -> FloatArray | None:
     """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``."""
     p = _attempted(continuous_riccati, a.T, h.T, process, weight, s=cross)
+    if p is None:
+        # SciPy takes a weight for singular where only the units of its rows are decades apart.
+        units = power_of_two_below(np.sqrt(np.maximum(np.diag(weight), SMALLEST)))
+        columns = None if cross is None else cross / units
+        p = _attempted(continuous_riccati, a.T, (h / units[:, None]).T, process, weight / np.outer(units, units),
+                       s=columns)  # fmt: skip
     # What an ill-conditioned equation gives is judged by its user: by poles, or by whether it proves anything.
     return None if p is None or not np.all(np.isfinite(p)) else p
 

@@ -394,18 +394,38 @@ def positive_vector(matrix: FloatArray) -> tuple[float, FloatArray]:
         return 0.0, np.zeros(0)
     if not np.isfinite(values).all():
         return np.inf, np.ones(size)
+    if not values.any():
+        return 0.0, np.ones(size)
+    best, at = _positive_vector(values)
+    if best < 1.0:
+        return best, at
+    # What is added to a matrix hides its small entries, which in other units are as large as the others.
+    scaled, units = balanced_matrix(values)
+    vector = units * _positive_vector(np.abs(scaled))[1]
+    quotient = _largest_quotient(values, vector)
+    return (quotient, vector) if quotient < best else (best, at)
+
+
+def _positive_vector(values: FloatArray) -> tuple[float, FloatArray]:
+    """Return the same for a nonnegative matrix, by its eigenvectors in the units that it is in."""
+    size, tiny, largest = len(values), np.finfo(np.float64).tiny, float(values.max())
     best, at = np.inf, np.ones(size)
-    largest = float(values.max())
-    if largest == 0.0:
-        return 0.0, at
     for shift in _SHIFTS:
         eigenvalues, vectors = np.linalg.eig(values + shift * largest)
-        vector = np.abs(vectors[:, int(np.argmax(eigenvalues.real))].real) + np.finfo(np.float64).tiny
-        vector = vector / vector.max() + np.finfo(np.float64).tiny
-        quotient = float(np.max(rounded_up(values @ vector, size + 3) / vector)) * (1.0 + 4.0 * UNIT_ROUNDOFF)
+        vector = np.abs(vectors[:, int(np.argmax(eigenvalues.real))].real) + tiny
+        vector = vector / vector.max() + tiny
+        quotient = _largest_quotient(values, vector)
         if quotient < best:
             best, at = quotient, vector
     return best, at
+
+
+def _largest_quotient(values: FloatArray, vector: FloatArray) -> float:
+    """Return an upper bound on the largest entry of ``values @ vector / vector``."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        quotients = rounded_up(values @ vector, len(values) + 3) / vector
+    largest = float(np.max(quotients)) * (1.0 + 4.0 * UNIT_ROUNDOFF)
+    return largest if np.isfinite(largest) and np.all(vector > 0.0) else np.inf
 
 
 def inverse_bound(matrix: FloatArray) -> FloatArray | None:

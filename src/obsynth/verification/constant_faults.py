@@ -19,7 +19,7 @@ Where x and z are known, what rounding adds as the observer runs in double preci
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -127,6 +127,11 @@ def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int 
     detail = "of plant and observer together, in exact arithmetic"
     if missed is not None and missed <= limit and settles:
         missed, detail = _as_it_runs(given, sizes, missed)
+        if not missed <= limit and _order(model) <= MOST_STATES_IN_BITS:
+            # Bounds of double precision were below the limit one by one: those of more digits may be so together.
+            closely = _decided(given, _missed_together, sizes, limit, STEADY_BITS)
+            if closely is not None:
+                missed, detail = _as_it_runs(given, sizes, closely, STEADY_BITS)
     elif not settles:
         alone = _decided(given, _missed_alone, sizes, limit)
         if alone is not None and not (missed is not None and missed <= limit):
@@ -147,11 +152,17 @@ def _order(model: ErrorModel) -> int:
 _Missed = Callable[[ConstantFaults, type[Any]], Any]
 
 
-def _decided(given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float) -> float | None:
+def _tried_bits(given: ConstantFaults) -> tuple[int, ...]:
+    """Return the digits, in bits, that are tried in turn; zero: double precision."""
+    return (0,) if _order(given.model) > MOST_STATES_IN_BITS else (0, *STEADY_BITS)
+
+
+def _decided(
+    given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float, tried: Sequence[int] | None = None
+) -> float | None:
     """Return a bound on the largest share that is missed, in as many digits as tell it from the limit."""
     value = None
-    many = _order(given.model) > MOST_STATES_IN_BITS
-    for bits in (0,) if many else (0, *STEADY_BITS):
+    for bits in _tried_bits(given) if tried is None else tried:
         miss: Ball | None
         if bits:
             with flint.ctx.workprec(bits):
@@ -230,13 +241,15 @@ def _settled(given: ConstantFaults, observer: LinearObserver, kind: type[Enclose
     return _Settled(outputs, inner, shown)
 
 
-def _as_it_runs(given: ConstantFaults, sizes: FloatArray, missed: float) -> tuple[float, str]:
+def _as_it_runs(
+    given: ConstantFaults, sizes: FloatArray, missed: float, tried: Sequence[int] | None = None
+) -> tuple[float, str]:
     """Return what the estimates miss at most as the observer runs in double precision, and how that was found."""
     try:
         observer = as_it_runs(given.model.observer)
     except (ValueError, np.linalg.LinAlgError):  # Numbers that are none.
         return np.nan, "of plant and observer together: the observer cannot be sampled"
-    known = _magnitudes(given, observer)
+    known = _magnitudes(given, observer, _tried_bits(given) if tried is None else tried)
     if known is None:
         return np.nan, "of plant and observer together, in exact arithmetic: rounding as it runs is not enclosed"
     outputs, states, apart = known
@@ -261,11 +274,12 @@ def _settling_time(observer: LinearObserver) -> float:
     return 1.0 / (1.0 - slowest) if slowest < 1.0 else np.inf
 
 
-def _magnitudes(given: ConstantFaults, observer: LinearObserver) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def _magnitudes(
+    given: ConstantFaults, observer: LinearObserver, tried: Sequence[int]
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return bounds on the outputs, on the states and on what sampling changes of the estimates; ``None`` without."""
-    many = _order(given.model) > MOST_STATES_IN_BITS
     known = None
-    for bits in (0,) if many else (0, *STEADY_BITS):
+    for bits in tried:
         kind: type[Any] = ExtendedBall if bits else Ball
         with flint.ctx.workprec(bits or STEADY_BITS[0]):
             settled = _settled(given, observer, kind)
