@@ -11,8 +11,10 @@ import pytest
 from benchmarks.campaigns._rational_plants import drawn_plant
 
 import obsynth
-from obsynth.methods.functional_filter import kalman_gain
+from obsynth.methods.functional_filter import kalman_gain, rates
+from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.plants.faults import exosystem
 from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -427,3 +429,20 @@ def test_a_long_chain_in_continuous_time_has_a_filter(
     design = obsynth.functional_filter(plant)
     assert design.report.passed
     assert design.report["constant fault"].value < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_search_with_rough_gains_comes_to_the_same_walk(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Large plants look for the walk with gains that are solved roughly: the walk is that of halving, or the next."""
+    rng = np.random.default_rng([52, seed])
+    a = rng.normal(size=(5, 5))
+    a *= 0.9 / np.max(np.abs(np.linalg.eigvals(a)))
+    plant = obsynth.DescriptorSystem(
+        A=a, C=rng.normal(size=(3, 5)), Bf=rng.normal(size=(5, 1)), dt=1.0, Dw=0.1 * np.eye(3)
+    )
+    (model,) = FunctionalFilter().filter_models(plant, exosystem("step", plant.fault_names, 1.0))
+    walks = {}
+    for least in (1, 1000):
+        monkeypatch.setattr(rates, "ROUGH_FROM", least)
+        walks[least] = rates.default_rates(model, settling_time(plant), lag=0)[0]
+    np.testing.assert_allclose(walks[1], walks[1000], rtol=1.5 * np.log(10.0) * 0.5**rates.RATE_BISECTIONS)

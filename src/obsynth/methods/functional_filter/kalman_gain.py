@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -147,6 +147,7 @@ class KalmanGain:
     innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
     covariance: FloatArray | None = None  # (n, n), of the errors of the prediction; ``None``: of poles
     step_time_and_miss: tuple[float, float] | None = None  # by default: s, share of a step missing then
+    shares: tuple[float, float] = (0.0, 0.0)  # of noise that states and exact rows were taken to have besides
 
 
 def exact_rows(model: FilterModel) -> FloatArray:
@@ -175,11 +176,19 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
 
 
 def kalman_gain(
-    model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0, insist: bool = False
+    model: FilterModel,
+    rates: FloatArray,
+    *,
+    lag: int = 0,
+    decay: float = 0.0,
+    insist: bool = False,
+    like: KalmanGain | None = None,
 ) -> KalmanGain:
     """Return the gain for walks of the fault models, ``rates (model states,)``; errors decay at ``decay`` (1/s).
 
     A decay may make modes unstable that nothing drives: with ``insist`` they get a gain, which may be very large.
+    ``like``, of other walks, is for a search: the shares of noise with which that gain was solved come first, and the
+    equation is solved no better than well.
     """
     n, p = model.A.shape[0], model.C.shape[0]
     if n == 0:
@@ -191,18 +200,21 @@ def kalman_gain(
     exact, sampled = exact_rows(model), model.dt > 0.0
     tried = product((False, True) if sampled and insist else (False,), SHARES_OF_NOISE,
                     SHARES_OF_EXACT_ROWS[sampled] if len(exact) else (0.0,))  # fmt: skip
+    first = [] if like is None else [(False, *like.shares)]
+    enough = SOLVED if like is None else WELL_SOLVED
     best, least = None, MOST_MISSED
-    for stable, share, trust in tried:
+    for stable, share, trust in (*first, *tried):
         if stable and best is not None:
             break
         drive = process + (share * unit) ** 2 * states
         rows = measured + (trust * unit) ** 2 * (exact.T @ exact)
         if sampled:
-            solved = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)), stable=stable)
+            growth = float(np.exp(decay * model.dt))
+            solved = _discrete(model, drive, rows, cross, lag, growth, stable=stable, enough=enough)
         else:
-            solved = _continuous(model, drive, rows, cross, decay)
+            solved = _continuous(model, drive, rows, cross, decay, enough=enough)
         if solved is not None and solved[1] <= least:
-            best, least = solved
+            best, least = replace(solved[0], shares=(share, trust)), solved[1]
         if least <= WELL_SOLVED:
             break
     if best is not None:
@@ -222,9 +234,10 @@ def _discrete(
     growth: float,
     *,
     stable: bool,
+    enough: float,
 ) -> tuple[KalmanGain, float] | None:
     equation = _Equation(growth * model.A, model.C, process, measured, growth * cross, sampled=True)
-    solution = equation.solution(stable=stable)
+    solution = equation.solution(stable=stable, enough=enough)
     if solution is None:
         return None
     p, missed = solution
@@ -241,11 +254,17 @@ def _discrete(
 
 
 def _continuous(
-    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
+    model: FilterModel,
+    process: FloatArray,
+    measured: FloatArray,
+    cross: FloatArray,
+    decay: float,
+    *,
+    enough: float,
 ) -> tuple[KalmanGain, float] | None:
     a = model.A + decay * np.eye(len(model.A))
     equation = _Equation(a, model.C, process, measured, cross, sampled=False)
-    solution = equation.solution()
+    solution = equation.solution(enough=enough)
     if solution is None:
         return None
     p, missed = solution
@@ -291,8 +310,9 @@ class _Equation:
             missed = float(np.linalg.norm(moved - correction + self.process)) / max(size, SMALLEST)
         return missed if np.isfinite(missed) else np.inf
 
-    def solution(self, *, stable: bool = False) -> tuple[FloatArray, float] | None:
-        """Return the covariance and what it misses the equation by; ``None`` where no stable filter came out.
+    def solution(self, *, stable: bool = False, enough: float = SOLVED) -> tuple[FloatArray, float] | None:
+        """Return the covariance and what it misses the equation by, ``enough`` where a search needs no less; ``None``
+        where no stable filter came out.
 
         Sampled, by doubling. It begins at zero, which solves the equation where nothing drives an unstable mode: with
         ``stable`` by the stable subspace then.
@@ -307,7 +327,7 @@ class _Equation:
         p = 0.5 * (p + p.T)
         missed = self.missed(p)
         for _ in range(MOST_NEWTON_STEPS):
-            if missed <= SOLVED or not np.isfinite(missed):
+            if missed <= enough or not np.isfinite(missed):
                 break
             better = self._stepped(p)
             less = np.inf if better is None else self.missed(better)
