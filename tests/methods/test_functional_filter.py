@@ -11,7 +11,7 @@ import pytest
 from benchmarks.campaigns._rational_plants import drawn_plant
 
 import obsynth
-from obsynth.methods.functional_filter import kalman_gain, rates
+from obsynth.methods.functional_filter import kalman_gain, rates, synthesis
 from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.plants.faults import exosystem
@@ -446,3 +446,21 @@ def test_a_search_with_rough_gains_comes_to_the_same_walk(seed: int, monkeypatch
         monkeypatch.setattr(rates, "ROUGH_FROM", least)
         walks[least] = rates.default_rates(model, settling_time(plant), lag=0)[0]
     np.testing.assert_allclose(walks[1], walks[1000], rtol=1.5 * np.log(10.0) * 0.5**rates.RATE_BISECTIONS)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_a_filter_without_a_proof_of_stability_is_written_in_triangular_states(
+    dt: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(521)
+    a = 0.3 * rng.normal(size=(4, 4)) - (1.0 - dt) * np.eye(4)
+    plant = obsynth.DescriptorSystem(A=a, C=rng.normal(size=(3, 4)), Bf=rng.normal(size=(4, 2)), dt=dt)
+    plain = obsynth.functional_filter(plant)
+    monkeypatch.setattr(synthesis, "contraction_of", lambda _: None)
+    other = obsynth.functional_filter(plant)
+    assert other.report.passed
+    # Up to pairs of poles that are not real.
+    assert np.abs(np.tril(other.observer.Az, -2)).max() < 1e-12 < np.abs(np.tril(plain.observer.Az, -2)).max()
+    np.testing.assert_allclose(
+        other.certificate.matrices["deviations"], plain.certificate.matrices["deviations"], rtol=1e-8
+    )

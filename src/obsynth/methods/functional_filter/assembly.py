@@ -70,8 +70,12 @@ class FilterPart:
     states: tuple[int, ...] = ()
 
 
-def filter_part(model: FilterModel, gain: KalmanGain, residual_map: FloatArray, *, delay: int, mean: int) -> FilterPart:
-    """Return the filter of a gain, with a delay in samples; ``residual_map (rows, p)``: residuals from innovations."""
+def filter_part(
+    model: FilterModel, gain: KalmanGain, residual_map: FloatArray, *, delay: int, mean: int, triangular: bool = False
+) -> FilterPart:
+    """Return the filter of a gain, with a delay in samples; ``residual_map (rows, p)``: residuals from innovations.
+
+    ``triangular``: in coordinates in which its matrix is so, even where its entries are small."""
     sizes = np.sqrt(np.maximum(np.diag(gain.innovation), 0.0))
     gain = replace(
         gain, K=_without_rounding(gain.K, sizes), lag=tuple(_without_rounding(part, sizes) for part in gain.lag)
@@ -82,7 +86,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, residual_map: FloatArray, 
     innovation = OutputRows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = OutputRows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
-    coordinates = _plain_coordinates(dynamics.C)
+    coordinates = _plain_coordinates(dynamics.C, 0.0 if triangular else FAR_FROM_NORMAL)
     if coordinates is not None:
         dynamics = _rounded_once(model, gain, coordinates)
         innovation, row = (OutputRows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
@@ -109,12 +113,13 @@ def _without_rounding(gain: FloatArray, sizes: FloatArray) -> FloatArray:
     return np.where(share > CANCELLATION_TOLERANCE * np.max(share, axis=1, initial=0.0, keepdims=True), gain, 0.0)
 
 
-def _plain_coordinates(a: FloatArray) -> FloatArray | None:
-    """Return coordinates in which A has entries as small as its eigenvalues (balanced real Schur); ``None``: it has."""
+def _plain_coordinates(a: FloatArray, most: float) -> FloatArray | None:
+    """Return coordinates in which A has entries as small as its eigenvalues (balanced real Schur); ``None``: it is at
+    ``most`` so many times as large already."""
     if not len(a) or not np.all(np.isfinite(a)):
         return None
     largest = float(np.max(np.abs(np.linalg.eigvals(a))))
-    if np.linalg.norm(balanced_matrix(a)[0], 2) <= FAR_FROM_NORMAL * largest:
+    if np.linalg.norm(balanced_matrix(a)[0], 2) <= most * largest:
         return None
     triangular, turn = schur(a, output="real")
     return np.asarray(turn * balanced_matrix(triangular)[1])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,9 @@ DECADES, RATE_BISECTIONS = 8, 9
 #: states these take a third of the time.
 ROUGH_FROM = 40
 
+#: What a rough search begins with: no share of noise.
+NO_GAIN = KalmanGain(np.zeros((0, 0)), (), np.zeros((0, 0)))
+
 
 #: Lags in samples, and walks relative to the middle one.
 TRIED_LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
@@ -77,48 +81,106 @@ def default_rates(
     noise = max(float(np.max(np.abs(model.M), initial=0.0)), float(np.max(np.abs(model.N), initial=0.0)))
     noise = noise or 1.0  # a fault that equations without noise tell
     unit = np.where(natural > 0.0, noise / sizes, noise / float(np.max(sizes, initial=1.0)))
-    tried: dict[float, KalmanGain | None] = {}
-
-    def gain(exponent: float) -> KalmanGain | None:
-        if exponent not in tried:
-            try:
-                tried[exponent] = kalman_gain(model, 10.0**exponent * unit, lag=lag)
-            except SolverError:
-                tried[exponent] = None
-        return tried[exponent]
-
-    def missed(exponent: float, seconds: float) -> float:
-        trial_gain = gain(exponent)
-        return np.inf if trial_gain is None else step_misses(model, trial_gain, seconds)
-
+    exactly = _TriedGains(model, unit, lag, roughly=False)
     if model.order >= ROUGH_FROM:
-        high = _rough_exponent(model, unit, seconds)
-        if high is not None and missed(high, seconds) <= RATE_REACHED:
-            return _at(model, 10.0**high * unit, _required_gain(gain(high)), seconds, lag)
+        try:
+            found = _slowest_walk(_TriedGains(model, unit, 0, roughly=True), seconds, longer)
+        except SolverError:
+            found = None
+        if found is not None and exactly.missed(found.exponent, found.seconds) <= found.most:
+            gain = _required_gain(exactly.gain(found.exponent))
+            return _at(model, 10.0**found.exponent * unit, gain, found.seconds, lag)
+    found = _slowest_walk(exactly, seconds, longer)
+    return _at(model, 10.0**found.exponent * unit, _required_gain(exactly.gain(found.exponent)), found.seconds, lag)
+
+
+class _TriedGains:
+    """The gains of walks of some powers of ten, each found once; ``roughly``: no better than a search needs, from the
+    share of noise that worked last."""
+
+    def __init__(self, model: FilterModel, unit: FloatArray, lag: int, *, roughly: bool) -> None:
+        self.model, self.unit, self.lag, self.roughly = model, unit, lag, roughly
+        self.gains: dict[float, KalmanGain | None] = {}
+
+    def gain(self, exponent: float) -> KalmanGain | None:
+        """Return the gain, ``None`` where there is none."""
+        if exponent not in self.gains:
+            like = None
+            if self.roughly:
+                like = next((gain for gain in reversed(self.gains.values()) if gain is not None), NO_GAIN)
+            try:
+                gain = kalman_gain(self.model, 10.0**exponent * self.unit, lag=self.lag, like=like)
+            except SolverError:
+                gain = None
+            self.gains[exponent] = gain
+        return self.gains[exponent]
+
+    def missed(self, exponent: float, seconds: float) -> float:
+        """Return what estimates miss of a step after a time, infinite without a gain."""
+        gain = self.gain(exponent)
+        return np.inf if gain is None else step_misses(self.model, gain, seconds)
+
+
+class _Walk(NamedTuple):
+    """A power of ten, after how long steps show with it, and what estimates may miss of them then."""
+
+    exponent: float
+    seconds: float
+    most: float
+
+
+def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
+    """Return the slowest walk with which steps are seen in time, or in so many times as long."""
     exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
     for waited in range(longer + 1):
         seconds *= LONGER if waited else 1.0
         misses: list[float] = []
         for exponent in exponents:
-            misses.append(missed(exponent, seconds))
+            misses.append(gains.missed(exponent, seconds))
             if misses[-1] <= RATE_REACHED:
                 break
         least = min(misses)
         if least <= NOTHING_SHOWN:
             break
-    if not any(slow_gain is not None for slow_gain in tried.values()):
+    if not any(gain is not None for gain in gains.gains.values()):
         raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
     high = exponents[len(misses) - 1]
     if least > RATE_REACHED:
         # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
         close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
-        high = next(e for e, miss in zip(exponents, misses, strict=True) if tried[e] is not None and miss <= close)
-    else:
-        low = high - 1.0
-        for _ in range(RATE_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if missed(middle, seconds) <= RATE_REACHED else (middle, high)
-    return _at(model, 10.0**high * unit, _required_gain(gain(high)), seconds, lag)
+        high = next(e for e, miss in zip(exponents, misses, strict=True) if gains.gain(e) is not None and miss <= close)
+        return _Walk(high, seconds, close)
+    if gains.roughly and len(misses) > 1:
+        return _Walk(_by_interpolation(gains, high, seconds), seconds, RATE_REACHED)
+    low = high - 1.0
+    for _ in range(RATE_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if gains.missed(middle, seconds) <= RATE_REACHED else (middle, high)
+    return _Walk(high, seconds, RATE_REACHED)
+
+
+def _by_interpolation(gains: _TriedGains, exponent: float, seconds: float) -> float:
+    """Return what halving of the decade below comes to, by fewer gains."""
+    steps = 2**RATE_BISECTIONS
+
+    def excess(step: int) -> float:
+        """Return the logarithm of what is missed at a step, over what may be."""
+        return float(np.log(max(gains.missed(step / steps, seconds), SMALLEST) / RATE_REACHED))
+
+    high = round(exponent) * steps
+    low, last_was_high = high - steps, True
+    above, below = excess(low), excess(high)
+    while high - low > 1:
+        middle, room = (low + high) // 2, high - low
+        if np.isfinite(above) and room > 2:
+            # A step beyond where the line crosses, on the side that was not looked at last: both ends move.
+            crossing = low + room * above / (above - below)
+            middle = int(np.floor(crossing)) - 1 if last_was_high else int(np.ceil(crossing)) + 1
+            middle = min(max(middle, low + 1), high - 1)
+        value = excess(middle)
+        last_was_high = value <= 0.0
+        low, above, high, below = (low, above, middle, value) if last_was_high else (middle, value, high, below)
+    return float(high / steps)
 
 
 def _at(
@@ -127,42 +189,6 @@ def _at(
     """Return walks, and their gain with when it shows a step."""
     slow_gain = _forgetting_gain(model, walks, gain, seconds, lag)
     return walks, replace(slow_gain, step_time_and_miss=(seconds, step_misses(model, slow_gain, seconds)))
-
-
-def _rough_exponent(model: FilterModel, unit: FloatArray, seconds: float) -> float | None:
-    """Return the first step of the search at which a walk shows a step in time, ``None`` where none does: what halving
-    comes to, by interpolation."""
-    steps, like = 2**RATE_BISECTIONS, KalmanGain(np.zeros((0, 0)), (), np.zeros((0, 0)))
-
-    def excess(step: int) -> float:
-        """Return the logarithm of what is missed at a step, over what may be."""
-        nonlocal like
-        try:
-            like = kalman_gain(model, 10.0 ** (step / steps) * unit, like=like)
-        except SolverError:
-            return np.inf
-        return float(np.log(max(step_misses(model, like, seconds), SMALLEST) / RATE_REACHED))
-
-    known, high = dict[int, float](), None
-    for exponent in range(-DECADES, DECADES + 1):
-        known[exponent * steps] = excess(exponent * steps)
-        if known[exponent * steps] <= 0.0:
-            high = exponent * steps
-            break
-    if high is None or high == -DECADES * steps:
-        return None
-    low = high - steps
-    while high - low > 1:
-        above, below = known[low], known[high]
-        middle, room = (low + high) // 2, high - low
-        if np.isfinite(above) and room > 2:
-            # A step beyond where the line crosses, on the side that was not looked at last: both ends move.
-            crossing = low + room * above / (above - below)
-            last_was_high = list(known)[-1] == high
-            middle = int(np.clip(np.floor(crossing) - 1 if last_was_high else np.ceil(crossing) + 1, low + 1, high - 1))
-        known[middle] = excess(middle)
-        low, high = (low, middle) if known[middle] <= 0.0 else (middle, high)
-    return float(high / steps)
 
 
 def _forgetting_gain(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -44,7 +44,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.results.design import Certificate
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 
 #: Errors that need longer than so many times the settling time are mentioned.
@@ -63,11 +63,16 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
     progress("choosing the gains")
     of_states = _state_parts(noisy, model, method)
     for longer in (MOST_LONGER, 0):
-        parts, rates, step_times = _parts(noisy, models, method, longer)
+        gains, rates, step_times = _gains(noisy, models, method, longer)
+        parts = _parts(gains, method)
         observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, method))
         if not any(seconds > settling_time(plant) for seconds, _ in step_times) or _is_above_rounding(plant, observer):
             break
     progress("building the realisation and its certificate")
+    if gains and contraction_of(observer) is None:
+        # Entries that cancel hide that it is stable.
+        parts = _parts(gains, method, triangular=True)
+        observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, method))
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
     walks = np.zeros(model.order)
     for part, walk in zip(models, rates, strict=True):
@@ -126,14 +131,27 @@ def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> boo
     return True
 
 
-def _parts(
+_ModelGain: TypeAlias = tuple[FilterModel, KalmanGain]
+
+
+def _parts(gains: Sequence[_ModelGain], method: FunctionalFilter, *, triangular: bool = False) -> list[FilterPart]:
+    """Return the filters of the gains, see `filter_part`."""
+    delay = 0 if method.poles is not None else method.delay
+    return [
+        filter_part(model, gain, whitening(gain.innovation), delay=delay, mean=method.mean, triangular=triangular)
+        for model, gain in gains
+    ]
+
+
+def _gains(
     plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter, longer: int
-) -> tuple[list[FilterPart], list[FloatArray], list[tuple[float, float]]]:
-    """Return the filters, the walks of their fault models' states, and when steps are seen with walks by default."""
+) -> tuple[list[_ModelGain], list[FloatArray], list[tuple[float, float]]]:
+    """Return models of the filters with their gains, the walks of their fault models' states, and when steps are seen
+    with walks by default."""
     if method.poles is not None and models:
         return _placed(plant, models, method), [np.zeros(model.drive.shape[1]) for model in models], []
     stated_rates = method.rates(plant)
-    parts, rates, step_times = [], [], []
+    gains, rates, step_times = [], [], []
     for model in models:
         require_noise(model, plant.output_names, plant.Dw)
         low = _low_order(plant, model, method)
@@ -143,8 +161,8 @@ def _parts(
             model, walks, gain = low
         rates.append(walks)
         step_times += [] if gain.step_time_and_miss is None else [gain.step_time_and_miss]
-        parts.append(filter_part(model, gain, whitening(gain.innovation), delay=method.delay, mean=method.mean))
-    return parts, rates, step_times
+        gains.append((model, gain))
+    return gains, rates, step_times
 
 
 def _low_order_note(plant: DescriptorSystem, models: Sequence[FilterModel]) -> str:
@@ -194,8 +212,8 @@ def _gain(
     return default_rates(model, settling_time(plant), lag=method.delay, longer=longer)
 
 
-def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter) -> list[FilterPart]:
-    """Return the filters with the poles asked for: one list, or one for each of several filters."""
+def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter) -> list[_ModelGain]:
+    """Return gains with the poles asked for: one list, or one for each of several filters."""
     pole_sets = [method.poles] if len(models) == 1 else list(method.poles)
     if len(pole_sets) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in pole_sets):
         orders = ", ".join(str(len(model.A)) for model in models)
@@ -204,18 +222,16 @@ def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], method: Func
             "[[-1], [-2, -3]], or ask for one fault, one set of residuals, or joint estimates.",
             path="method.options.poles",
         )
-    return [_placed_filter(plant, model, poles, method) for model, poles in zip(models, pole_sets, strict=True)]
+    return [(model, _placed_gain(plant, model, poles)) for model, poles in zip(models, pole_sets, strict=True)]
 
 
-def _placed_filter(
-    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], method: FunctionalFilter
-) -> FilterPart:
+def _placed_gain(plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any]) -> KalmanGain:
     fixed = np.zeros(0, dtype=np.complex128)
     wanted_poles = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
     gain = place(model.A, model.C, wanted_poles, dt=plant.dt)[0]
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
     noise = model.M @ model.M.T if plant.nw and rounding_rank(model.M) == len(model.M) else np.eye(len(model.C))
-    return filter_part(model, KalmanGain(gain, lag, noise), whitening(noise), delay=0, mean=method.mean)
+    return KalmanGain(gain, lag, noise)
 
 
 def _residual_names(
