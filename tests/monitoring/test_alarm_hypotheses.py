@@ -179,6 +179,12 @@ def test_faults_of_the_plant_come_first_where_shares_do_not_decide():
     assert ranking(45.0, 43.0, 3.0).called(("leak", "worn")) == ""
 
 
+def test_residuals_that_have_overflowed_are_ranked_as_nothing():
+    assert ranking(np.inf, 5.0, 3.0) is None
+    assert ranking(45.0, np.nan, 3.0) is None
+    assert ranking(45.0, 5.0, 3.0, shift=np.inf) is None
+
+
 def test_what_nothing_explains_is_none_of_these_faults():
     assert ranking(4.0, 5.0, 3.0, shift=10.0) is None
     found = ranking(30.0, 5.0, 3.0, shift=200.0)

@@ -14,8 +14,16 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.monitoring.thresholds.learned_statistics import Statistics
 from obsynth.monitoring.thresholds.learning import learn_thresholds
-from obsynth.monitoring.thresholds.sensor_drifts import drifts_by_runs, linear_drifts, sensor_deviations
+from obsynth.monitoring.thresholds.sensor_drifts import (
+    SensorDrifts,
+    drift_limits,
+    drifts_by_runs,
+    linear_drifts,
+    sensor_deviations,
+)
+from obsynth.numerics.autoregression import Autoregression
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 
@@ -70,6 +78,14 @@ def test_a_drift_that_is_allowed_for_is_no_alarm_and_larger_faults_are() -> None
     assert in_alarm(design, allowed, faulty)[510:].mean() > 0.9
     assert "drift of each sensor by 3 deviations" in allowed.statement
     assert "drift of each sensor" not in without.statement
+    # What is not allowed for alarms from the limit that the sentence states, and not at half of it.
+    limit = without.drift_limits["y1"]
+    assert f"a slow drift of y1 by {limit:.2g}" in without.statement
+    assert not allowed.drift_limits
+    assert (
+        in_alarm(design, without, drifting.assign(y1=linear_log(1)["y1"] + 1.2 * limit * NOISE[0]))[400:].mean() > 0.5
+    )
+    assert in_alarm(design, without, drifting.assign(y1=linear_log(1)["y1"] + 0.5 * limit * NOISE[0])).mean() < 0.1
 
 
 def test_the_steady_state_of_a_linear_observer_is_what_runs_settle_at() -> None:
@@ -135,6 +151,22 @@ def test_the_statement_names_sensors_without_room(tmp_path: Path) -> None:
     assert found.without_drift == ("y2",)
     assert "drift of each sensor but y2 by one deviation" in found.statement
     assert obsynth.load_thresholds(found.save(tmp_path / "t.json")).without_drift == ("y2",)
+
+
+def test_a_drift_at_its_limit_passes_a_level_and_one_below_none() -> None:
+    """Whitened residuals that are a sensor in its deviations: what passes first is the mean with the longest memory, or
+    a step of the highest age."""
+    model = Autoregression(np.zeros(1), np.zeros((0, 1, 1)), np.eye(1))
+    statistics = Statistics(model, np.eye(1), ("r[y]",))
+    levels = np.full(len(statistics.names), 40.0)
+    nothing = np.zeros((1, 0, 0))
+    drifts = SensorDrifts(np.ones((1, 400, 1)), nothing, nothing, nothing, np.ones(1))
+    (limit,) = drift_limits(statistics, levels, drifts, [0])
+    assert limit == pytest.approx(np.sqrt(40.0 / 200.0), abs=0.01)
+    # Offsets that alarm nothing add to it, and levels that no drift of one deviation passes have none.
+    banded = dataclasses.replace(statistics, bands=np.array([0.2]))
+    assert limit + 0.15 < drift_limits(banded, levels, drifts, [0])[0] < limit + 0.25
+    assert drift_limits(statistics, 1e3 * levels, drifts, [0])[0] == np.inf
 
 
 def test_a_drift_is_refused_where_the_observer_integrates() -> None:
@@ -207,6 +239,9 @@ def test_faults_that_walk_have_bands_of_what_a_drift_makes_of_them() -> None:
     assert allowed.statistics.fault_bands[0] == pytest.approx(0.1, rel=0.3)
     drifting = walking_log(1, drift=2.0)
     assert in_alarm(design, without, drifting)[200:].mean() > 0.3
+    limit = without.drift_limits["y"]
+    assert in_alarm(design, without, walking_log(1, drift=1.3 * limit))[250:].mean() > 0.3
+    assert in_alarm(design, without, walking_log(1, drift=0.5 * limit))[200:].mean() < 0.1
     assert in_alarm(design, allowed, drifting)[200:].mean() < 0.02
     # In another unit of the log everything is the same.
     scaled = walking_log(0)

@@ -57,10 +57,13 @@ def hypotheses_of(faults: Sequence[str], outputs: Sequence[str]) -> tuple[Hypoth
 
 
 def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Ranking | None:
-    """Return the ranking of what hypotheses explain; `None` where none of them, and no shift, explains anything.
+    """Return the ranking of what hypotheses explain; `None` where none of them, and no shift, explains anything, or
+    residuals have overflowed.
 
     Where shares do not decide, the faults of the plant come first, and the others are ties.
     """
+    if not (np.isfinite(explanation.ratios).all() and np.isfinite(explanation.shift)):
+        return None
     best = dict[str, int]()
     drifts = set[str]()
     for i, hypothesis in enumerate(hypotheses):

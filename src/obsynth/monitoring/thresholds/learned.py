@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,6 +112,9 @@ class LearnedThresholds:
         Deviations of its noise by which each sensor may drift slowly without an alarm; zero: none is allowed for.
     without_drift : tuple of str
         Sensors for which none is allowed for all the same, as nothing is known of their noise or of what a drift does.
+    drift_limits : mapping of str to float
+        Of one log, where no drift is allowed for: by how many deviations of its noise, below one, a slow drift of a
+        sensor alarms for as long as it lasts.
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
@@ -142,6 +145,7 @@ class LearnedThresholds:
     repeats: FloatArray | None = None
     sensor_drift: float = 0.0
     without_drift: tuple[str, ...] = ()
+    drift_limits: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def holds(self) -> bool:
@@ -184,6 +188,13 @@ class LearnedThresholds:
                     if unknown
                     else ""
                 )
+            )
+        if self.drift_limits:
+            limits = " or of ".join(f"{name} by {limit:.2g}" for name, limit in self.drift_limits.items())
+            text += (
+                f"; one log does not rule out that sensors drift otherwise in others, and a slow drift of {limits} "
+                "deviations of its noise alarms as long as it lasts: give three normal logs, or allow for it "
+                "(sensor_drift)"
             )
         if self.lasting:
             text += (
@@ -255,6 +266,7 @@ class LearnedThresholds:
             "repeats": self.repeats,
             "sensor_drift": self.sensor_drift,
             "without_drift": list(self.without_drift),
+            "drift_limits": dict(self.drift_limits),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -391,4 +403,5 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         None if data.get("repeats") is None else read_only(np.asarray(data["repeats"], dtype=np.float64)),
         real_number(data.get("sensor_drift", 0.0), "sensor_drift", "deviations, 0 or more", least=0.0),
         tuple(map(str, data.get("without_drift", ()))),
+        {str(name): float(limit) for name, limit in data.get("drift_limits", {}).items()},
     )

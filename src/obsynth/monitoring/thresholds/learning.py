@@ -36,7 +36,9 @@ from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows, not
 from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
 from obsynth.monitoring.thresholds.sensor_drifts import (
     DRIFT_ROWS,
+    LIMIT_ROWS,
     SensorDrifts,
+    drift_limits,
     drifts_by_runs,
     linear_drifts,
     sensor_deviations,
@@ -187,7 +189,8 @@ def learn_thresholds(
     wanted = [(a + first, a + last) for a, b in logs.ends for first, last in [parsed_rows(rows, b - a)]]
     output = output.of_rows(wanted)
     dt = _sample_time(design, output)
-    drifts = _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift)
+    offsets = sensor_deviations(design, signals.deviations(logs.rows)[:, -len(logs.repeats) :])
+    drifts = _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift * offsets) if sensor_drift else None
     options: dict[str, Any] = {
         "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs,
         "logs": logs.slices_of(output.numbers), "repeats": logs.repeats,
@@ -214,6 +217,9 @@ def learn_thresholds(
         learned,
         notes=(*notes, *notes_of_sizes(white, inputs), *notes_of_starts(divided)),
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
+        drift_limits=_drift_limits(design, lambda: new_run(sizes, starts), logs, offsets, learned)
+        if drifts is None and len(logs.ends) == 1
+        else {},
     )
 
 
@@ -256,14 +262,14 @@ class _NormalLogs:
 
 
 def _drifts(
-    design: ObserverDesign, started: Callable[[], LogRun], logs: _NormalLogs, sensor_drift: float
-) -> SensorDrifts | None:
-    """Return what drifts of so many deviations of each sensor do to the rows that a design makes of normal logs; `None`
-    where none is allowed for."""
-    if not sensor_drift:
-        return None
-    signals, ny = started().signals, len(logs.repeats)
-    offsets = sensor_drift * sensor_deviations(design, signals.deviations(logs.rows)[:, -ny:])
+    design: ObserverDesign,
+    started: Callable[[], LogRun],
+    logs: _NormalLogs,
+    offsets: FloatArray,
+    most: int = DRIFT_ROWS,
+) -> SensorDrifts:
+    """Return what drifts of sensors by ``offsets (ny,)`` do to the rows that a design makes of normal logs, from
+    ``most`` of these where it has to run for it."""
     if not offsets.any():
         raise SpecError(
             "No noise of any sensor is stated, and the log shows none: a drift in deviations of it is nothing. State "
@@ -272,8 +278,9 @@ def _drifts(
         )
     if isinstance(design.observer, LinearObserver):
         return linear_drifts(design.observer, offsets)
+    signals, ny = started().signals, len(offsets)
     first, last = max(logs.ends, key=lambda ends: ends[1] - ends[0])
-    log = logs.rows[first : min(last, first + DRIFT_ROWS)]
+    log = logs.rows[first : min(last, first + most)]
 
     def run(added: FloatArray) -> _ObserverOutput:
         moved = log.copy()
@@ -281,6 +288,26 @@ def _drifts(
         return _output_of_log(design, started(), moved, first)
 
     return drifts_by_runs(run, offsets)
+
+
+def _drift_limits(
+    design: ObserverDesign,
+    started: Callable[[], LogRun],
+    logs: _NormalLogs,
+    offsets: FloatArray,
+    learned: LearnedThresholds,
+) -> dict[str, float]:
+    """Return by which share of one of its deviations, ``offsets (ny,)``, a slow drift of a sensor alarms for as long as
+    it lasts, where it is below one: one log says nothing of those of other logs."""
+    try:
+        drifts = _drifts(design, started, logs, offsets, LIMIT_ROWS)
+    except SpecError:
+        return {}
+    columns = [watched_names(design).index(name) for name in learned.columns]
+    limits = drift_limits(learned.statistics, learned.levels, drifts, columns)
+    signals = started().signals
+    names = signals.names[signals.inputs :]
+    return {name: float(limit) for name, limit in zip(names, limits, strict=True) if np.isfinite(limit)}
 
 
 def _ends_of(borders: NDArray[np.int64]) -> list[tuple[int, int]]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING, Statistics
-from obsynth.monitoring.thresholds.parameter_scores import Scores
+from obsynth.monitoring.thresholds.parameter_scores import Scores, beyond
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import MOST_ORDER
 from obsynth.observers.linear.observer import LinearObserver
@@ -27,6 +27,9 @@ from obsynth.results.design import ObserverDesign
 
 #: An observer runs again over so many rows of a log: an offset has settled in the first half of them.
 DRIFT_ROWS = 3_000
+
+#: What a drift that nobody allows for does is judged over so many rows, and to this share of its size.
+LIMIT_ROWS, LIMIT_SHARE = 1_000, 0.01
 
 #: Effects change with the inputs: this share of the rows has smaller ones.
 EFFECT_SHARE = 0.95
@@ -90,6 +93,33 @@ def with_room_for_drifts(
     raised = levels.copy()
     raised[: len(gains)] = (np.sqrt(raised[: len(gains)]) + gains * max(added - size, 0.0)) ** 2
     return replace(statistics, bands=read_only(bands), fault_bands=of_faults), read_only(raised)
+
+
+def drift_limits(statistics: Statistics, levels: FloatArray, drifts: SensorDrifts, columns: list[int]) -> FloatArray:
+    """Return the least share ``(ny,)`` of the offset of each sensor that, without noise, passes a level of a statistic
+    for as long as it lasts; infinite where the whole offset passes none."""
+    white = np.median(drifts.white_means(statistics, columns), axis=1)
+    rows = np.repeat(white[:, None], max(AGES), axis=1)
+    faults = len(statistics.estimates) if drifts.away.size else 0
+    count, bands = len(levels) - 2 * len(statistics.estimates), statistics.fault_bands
+    if faults:
+        power, away = (np.median(_window_sums(part), axis=1) for part in (drifts.information, drifts.away))
+
+    def passed(shares: FloatArray) -> NDArray[np.bool_]:
+        values = (statistics.of_rows(shares[:, None, None] * rows)[:, :, -1] / levels[:count, None]).max(axis=0)
+        if faults:
+            far = beyond(shares[:, None] * away, power * (0.0 if bands is None else bands))
+            ratios = far**2 / np.maximum(power, np.finfo(float).tiny)
+            values = np.maximum(values, (ratios / levels[count : count + faults]).max(axis=1))
+        return np.asarray(values > 1.0)
+
+    low, high = np.zeros(len(white)), np.ones(len(white))
+    whole = passed(high)
+    while (high - low).max(initial=0.0) > LIMIT_SHARE:
+        middle = (low + high) / 2.0
+        above = passed(middle)
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return np.where(whole & ~drifts.sensors_without(), high, np.inf)
 
 
 def sensor_deviations(design: ObserverDesign, outputs: FloatArray) -> FloatArray:

@@ -104,5 +104,6 @@ def _payload(learned: LearnedThresholds) -> dict[str, Any]:
         "logs": learned.logs,
         "sensor_drift": learned.sensor_drift,
         "without_drift": list(learned.without_drift),
+        "drift_limits": dict(learned.drift_limits),
         "healthy_time": learned.healthy_time._asdict(),
     }
