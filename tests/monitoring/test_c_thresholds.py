@@ -25,12 +25,16 @@ def uneven() -> obsynth.DescriptorSystem:
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
-@pytest.mark.parametrize(("make", "level"), [(drive, "-O2"), (wang, "-O0"), (uneven, "-O0")])
-def test_c_gives_the_thresholds_of_python(tmp_path: Path, make, level: str) -> None:
+@pytest.mark.parametrize(
+    ("make", "level", "start"),
+    [(drive, "-O2", "initial_error"), (wang, "-O0", "initial_error"), (uneven, "-O0", "initial_set")],
+)
+def test_c_gives_the_thresholds_of_python(tmp_path: Path, make, level: str, start: str) -> None:
     plant = make()
     design = obsynth.fault_estimation_filter(plant)
+    known = {"initial_error": 0.3, "initial_set": dict.fromkeys(plant.state_names, 0.3)}[start]
     monitor = obsynth.online_monitor(
-        design, constants=plant.uncertainty, noise_bound=1.0 if plant.nw else None, initial_error=0.3,
+        design, constants=plant.uncertainty, noise_bound=1.0 if plant.nw else None, **{start: known},
         disturbance_bounds={plant.disturbance_names[0]: 0.1},
     )  # fmt: skip
     source, _ = obsynth.export(design, tmp_path / "filter.c", monitor=monitor)
@@ -48,6 +52,13 @@ def test_c_gives_the_thresholds_of_python(tmp_path: Path, make, level: str) -> N
     for k in range(120):
         code.filter_thresholds_step(state, pointer(u[0, k]), pointer(y[0, k]), pointer(rows[0, k]), pointer(total))
         assert total == pytest.approx(python[k], rel=1e-10)
+    # A row in which something is missing bounds nothing, and the next one is the first after a later start.
+    code.filter_thresholds_step(state, pointer(u[0, 0]), pointer(y[0, 0]), pointer(rows[0, 0] * np.nan), pointer(total))
+    assert np.isposinf(total).all()
+    again = thresholds_of_records(monitor.rule.later.bound, rows @ bound.structure.reading.T, u, y).total[0]
+    for k in range(120):
+        code.filter_thresholds_step(state, pointer(u[0, k]), pointer(y[0, k]), pointer(rows[0, k]), pointer(total))
+        assert total == pytest.approx(again[k], rel=1e-10)
 
 
 @pytest.mark.long

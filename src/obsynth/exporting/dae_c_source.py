@@ -190,14 +190,17 @@ def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
         comment("Thresholds over the tolerances of the plant: of the faults, then of the residuals."),
         "typedef struct {",
         *(f"    double {name}[{size}];" for name, size in zip(("psi", "ring", "eps", "largest"), sizes, strict=True)),
-        "    int at;",
+        "    int at, again;",
         "    long k;",
         f"}} {prefix}_thresholds;",
         "",
         f"void {prefix}_thresholds_reset({prefix}_thresholds *state);",
         "",
         comment("After each step of the observer: u, y, and its states, faults and residuals one after the other;"),
-        comment(f"total gets {no} numbers."),
+        comment(
+            f"total gets {no} numbers. A number that is not finite, as residuals in a gap, begins them again: total"
+        ),
+        comment("is infinite in that row, and bounds the others where the status of the observer is OK."),
         f"void {prefix}_thresholds_step({prefix}_thresholds *state, const double *u, const double *y,",
         "                               const double *rows, double *total);",
         "",
@@ -205,8 +208,9 @@ def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
-    """Return tables and functions, for the end of the source; `SpecError` for constants that vary."""
+def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) -> str:
+    """Return tables and functions, for the end of the source, with the bound from the first start on and that ``after``
+    a later one; `SpecError` for constants that vary."""
     if bound.varying:
         raise SpecError(
             "Thresholds are written as C for constants that stay the same (variation: constant).", path="monitor"
@@ -216,7 +220,11 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
     n, out = structure.reading.shape
     nv = bound.drive.shape[2]
     ny = bound.rounding.shape[1] - 1 - nv
-    theta, later = bound.start_later
+    (theta, later), (theta_after, later_after) = bound.start_later, after.start_later
+    starts, lasting = bound.start, later[None]
+    same = np.array_equal(bound.start, after.start) and np.array_equal(later, later_after)
+    if not same:
+        starts, lasting = np.vstack([starts, after.start]), np.vstack([lasting, later_after])
     sizes = {
         "P": p,
         "NZ": nz,
@@ -235,6 +243,9 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         "OWN": len(structure.owner),
         "DRIVEN": len(bound.remainder_inputs),
         "START": len(bound.start),
+        "AGAIN": len(after.start),
+        "AGAIN_AT": 0 if same else len(bound.start),
+        "LATER_AT": 0 if same else 1,
     }
     tables = {
         "Az": structure.Az,
@@ -249,15 +260,15 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         "tail": bound.tail,
         "nominal": bound.nominal[None],
         "rounding": bound.rounding,
-        "start": bound.start,
-        "later": later[None],
+        "start": starts,
+        "later": lasting,
         "driven": np.array([bound.remainder_inputs], dtype=np.float64),
     }
     enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     lines = [
         "",
         f"enum {{ {enumerated} }};",
-        f"static const double THETA = {theta!r};",
+        f"static const double THETA = {max(theta, theta_after)!r};",
         f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
         "",
         *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),

@@ -210,12 +210,12 @@ def export(
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
         )
-    bound = (
+    bounds = (
         None
         if monitor is None or written is not None
         else registered("bound_of_monitor")(monitor, realisation.observer)
     )
-    return _write_c(realisation, target, linear_alarms(realisation, thresholds, warm_up, written), bound)
+    return _write_c(realisation, target, linear_alarms(realisation, thresholds, warm_up, written), bounds)
 
 
 def _checked_target(path: str | Path) -> Path:
@@ -367,7 +367,10 @@ def exported_files(target: Path) -> dict[Path, FileKind | None]:
 
 
 def _write_c(
-    realisation: Realisation, target: Path, alarms: Alarms, bound: AdaptiveBound | None = None
+    realisation: Realisation,
+    target: Path,
+    alarms: Alarms,
+    bounds: tuple[AdaptiveBound, AdaptiveBound] | None = None,
 ) -> tuple[Path, ...]:
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
@@ -375,10 +378,10 @@ def _write_c(
     if realisation.precision != "double":
         declared = f"{comment(quoted(float_error(realisation)))}\n{declared}"
     source, declared = in_precision(source, realisation.precision), in_precision(declared, realisation.precision)
-    if bound is not None:
+    if bounds is not None:
         if realisation.precision != "double":
             raise SpecError("Thresholds over tolerances are guaranteed in double precision only.", path="precision")
         begin, end = declared.rsplit("#endif", 1)
-        declared = begin + threshold_header(bound, prefix) + "#endif" + end
-        source += threshold_source(bound, prefix)
+        declared = begin + threshold_header(bounds[0], prefix) + "#endif" + end
+        source += threshold_source(*bounds, prefix)
     return write_together({target: source, header: with_c_linkage(declared, prefix)})

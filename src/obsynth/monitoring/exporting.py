@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import STATISTIC, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
+from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
@@ -180,15 +181,15 @@ def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC 
     )
 
 
-def bound_of_monitor(monitor: Monitor, observer: LinearObserver) -> AdaptiveBound:
-    """Return the bound of an adaptive monitor of an observer that is written."""
+def bound_of_monitor(monitor: Monitor, observer: LinearObserver) -> tuple[AdaptiveBound, AdaptiveBound]:
+    """Return the bounds of an adaptive monitor of an observer that is written: from the first start on, and after a
+    later one."""
     monitor.require_fit(len(observer.residual_names), observer.fault_names)
-    plan = getattr(monitor.rule, "plan", None)
-    bound: AdaptiveBound | None = None if plan is None else plan.bound
-    if bound is None:
+    rule = monitor.rule
+    if not isinstance(rule, AdaptiveRule):
         raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
-    if bound.first is not None:
+    if rule.plan.bound.first is not None:
         raise SpecError(
             "Thresholds of continuous designs are not written as C: sample the plant first.", path="monitor"
         )
-    return bound
+    return rule.plan.bound, rule.later.bound

@@ -1,7 +1,7 @@
 /* Thresholds over the tolerances of the plant: the recursion of obsynth, for constants that stay the same.
  * Tables and sizes stand before this text; PREFIX is the name of the observer. */
 
-void PREFIX_thresholds_reset(PREFIX_thresholds *state)
+static void begin_thresholds(PREFIX_thresholds *state, int again)
 {
     int i;
     for (i = 0; i < P * NZ; i++) state->psi[i] = 0.0;
@@ -9,7 +9,21 @@ void PREFIX_thresholds_reset(PREFIX_thresholds *state)
     for (i = 0; i < L * NZ; i++) state->eps[i] = 0.0;
     for (i = 0; i < NR; i++) state->largest[i] = i == NR - 1 ? 1.0 : 0.0;
     state->at = 0;
+    state->again = again;
     state->k = 0;
+}
+
+void PREFIX_thresholds_reset(PREFIX_thresholds *state) { begin_thresholds(state, 0); }
+
+static int are_finite(const double *values, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) {
+        if (!isfinite(values[i])) {
+            return 0;
+        }
+    }
+    return 1;
 }
 
 static double size_of(double value) { return value < 0.0 ? -value : value; }
@@ -19,7 +33,18 @@ void PREFIX_thresholds_step(PREFIX_thresholds *state, const double *u, const dou
 {
     double v[NV + 1], seen[ROWS + NO + 1], moved[ROWS + 1], middle[ROWS + NO + 1], first[NO + 1], shift[NO + 1];
     double next[NZ + 1], known[W + 1], older[M + NO + NZ], fixed[M + NO + 1], h[W + 1], channels[M + 1];
+    const double *start, *later;
+    int known_start;
     int i, j, p, r;
+    if (!(are_finite(u, NU) && are_finite(y, NY) && are_finite(rows, OUT))) {
+        /* What was missing has left an error of its own: the bounds begin again, as after a later start. */
+        begin_thresholds(state, 1);
+        for (i = 0; i < NO; i++) total[i] = HUGE_VAL;
+        return;
+    }
+    known_start = state->k < (state->again ? AGAIN : START);
+    start = thresholds_start[(state->again ? AGAIN_AT : 0) + (known_start ? state->k : 0)];
+    later = thresholds_later[state->again ? LATER_AT : 0];
     for (i = 0; i < N; i++) {
         v[i] = 0.0;
         for (j = 0; j < OUT; j++) v[i] += thresholds_reading[i][j] * rows[j];
@@ -75,23 +100,23 @@ void PREFIX_thresholds_step(PREFIX_thresholds *state, const double *u, const dou
     }
     for (i = 0; i < M; i++) {
         h[i] = known[i] + older[i] + fixed[i] + thresholds_nominal[0][i];
-        h[i] += state->k < START ? thresholds_start[state->k][i] : 0.0;
+        h[i] += known_start ? start[i] : 0.0;
         for (p = 0; p < W; p++) h[i] += known[p] * thresholds_same[p][i];
         for (p = 0; p < M; p++) h[i] += thresholds_solved[i][p] * channels[p];
-        if (state->k >= START) {
+        if (!known_start) {
             double left = 1.0;
             for (p = 0; p < state->k / L && p < 200; p++) left *= THETA;
-            h[i] += left * thresholds_later[0][i];
+            h[i] += left * later[i];
         }
     }
     for (i = M; i < W; i++) h[i] = known[i];
     for (i = 0; i < NO; i++) {
         double sum = thresholds_nominal[0][M + i] + first[i] + shift[i] + older[M + i] + fixed[M + i];
         double left = 1.0;
-        if (state->k < START) sum += thresholds_start[state->k][M + i];
+        if (known_start) sum += start[M + i];
         else {
             for (p = 0; p < state->k / L && p < 200; p++) left *= THETA;
-            sum += left * thresholds_later[0][M + i];
+            sum += left * later[M + i];
         }
         for (p = 0; p < W; p++) sum += h[p] * thresholds_same[p][M + i];
         total[i] = sum * ROUNDED;

@@ -44,7 +44,7 @@ class AdaptiveRule(Rule):
     adapts = True
 
     def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule | None) -> None:
-        self.plan, self._later, self.nominal = plan, later, nominal
+        self.plan, self.later, self.nominal = plan, later, nominal  # from the first start on, and after later ones
         self.table, self.columns = None if nominal is None else nominal.table, plan.columns
 
     def init(self) -> AdaptiveRuleState:
@@ -60,7 +60,7 @@ class AdaptiveRule(Rule):
         nominal = state.nominal
         if self.nominal is not None and nominal is not None:
             nominal = self.nominal.restart(nominal)
-        return self._begun(nominal, self._later)._replace(first=False, last=state.last, waiting=state.waiting)
+        return self._begun(nominal, self.later)._replace(first=False, last=state.last, waiting=state.waiting)
 
     def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, RuleOutput]:
         """Return the state, statistic and threshold: those of the residual's norm, or of the row passed most."""
@@ -70,8 +70,8 @@ class AdaptiveRule(Rule):
         last, state = state.last, state._replace(last=sample.time)
         if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
             # What the observer did over another interval is an error of its own, which must decay first.
-            state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
-        plan = self.plan if state.first else self._later
+            state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self.later.bound.length)
+        plan = self.plan if state.first else self.later
         signals, bound = (observation.inputs, observation.outputs), plan.bound
         without, thresholds = adaptive_step(bound, state.without, bound.structure.reading @ observation.rows, *signals)
         during, error = state.during, thresholds
