@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from obsynth import DAEModel, PreconditionError, calibrate
 from obsynth.monitoring.calibration.logs import read_log
 from obsynth.monitoring.calibration.long_logs import SEARCHED_ROWS, searched_rows
+from obsynth.monitoring.calibration.maximum import Maximum, avoided_variances, descent, without_collapse
 from obsynth.monitoring.calibration.simulation_error import _runs_away
 
 TANK = DAEModel(
@@ -86,3 +90,34 @@ def test_a_force_that_is_integrated_twice_is_told_as_such() -> None:
     with pytest.raises(PreconditionError, match=r"runs away from alt .* random walk \(walks: push\)"):
         calibrate(mass, log, {"drag": (0.04, 0.06)}, offset={}, starts=1, input_delay=0,
                   integration="backward-euler")  # fmt: skip
+
+
+class OneVariance:
+    """A likelihood that does not distinguish a variance from zero, and where searches of it began."""
+
+    size, nt, bent = 1, 0, False
+    free, is_q, is_r = np.array([True]), np.array([True]), np.array([False])
+    low, high, first = np.array([-20.0]), np.array([20.0]), np.zeros(1)
+    problem = SimpleNamespace(noisy=("balance",))
+
+    def __init__(self) -> None:
+        self.avoided, self.starts = np.zeros(1), list[float]()
+
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        return float(np.exp(z[0]) - 0.5 * self.avoided @ z), np.exp(z) - 0.5 * self.avoided
+
+    def descent(self, start: np.ndarray) -> tuple[float, np.ndarray]:
+        self.starts.append(float(start[0]))
+        return descent(self, start, self.low, self.high, np.ones(1))
+
+
+def test_a_variance_that_is_kept_from_zero_is_sought_where_fewer_rows_have_it() -> None:
+    places = []
+    for known in (None, np.array([-0.5]), np.array([np.nan])):
+        objective: Any = OneVariance()
+        collapsed = np.array([-10.0])
+        found = without_collapse(objective, Maximum(collapsed, 0.0, np.eye(1), collapsed), lambda text: None, known)
+        assert found.z[0] == pytest.approx(np.log(0.5), abs=1e-4)
+        assert avoided_variances(objective, found.z) == pytest.approx(found.z)
+        places.append(objective.starts)
+    assert places == [[0.0, 3.0, -3.0], [-0.5], [0.0, 3.0, -3.0]]

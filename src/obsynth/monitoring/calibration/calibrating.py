@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out, wrong_samples
-from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
+from obsynth.monitoring.calibration.innovations_fit import (
+    InnovationsFit,
+    box_beside,
+    chosen_timing,
+    innovations_fit,
+)
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.likelihood import Likelihood
 from obsynth.monitoring.calibration.linear_plant import LinearPlant
@@ -444,16 +449,13 @@ class _Fitting:
         wide = wide.with_start(P0)
         try:
             fits = simulation_fits(wide, 1, self.seed, self.note, start=fit.t)
-            many = is_long(problem.log)
-            again, _ = innovations_fit(wide, fits, self.level, self.note, known=fit if many else None, quick_box=many)
+            beside = box_beside(wide, fits, self.level, self.note, fit if is_long(problem.log) else None)
         except (PreconditionError, SolverError):
-            again = None
-        if again is None:
             noted = problem.with_notes(OFFSETS_UNTRIED)
             return replace(fitted, problem=noted)
         sides = [
             (min(low, other_low, key=lambda side: side.value), max(high, other_high, key=lambda side: side.value))
-            for (low, high), (other_low, other_high) in zip(fit.sides, again.sides, strict=True)
+            for (low, high), (other_low, other_high) in zip(fit.sides, beside, strict=True)
         ]
         noted = problem.with_notes(OFFSETS_ALLOWED.format(", ".join(unseen), UNSEEN_OFFSET))
         return replace(fitted, problem=noted, fit=replace(fit, sides=sides))

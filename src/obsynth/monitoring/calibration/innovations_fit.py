@@ -21,6 +21,7 @@ from obsynth.monitoring.calibration.maximum import (
     Maximum,
     Objective,
     at_bounds,
+    avoided_variances,
     collapsed,
     greatest_likelihood,
     without_collapse,
@@ -65,6 +66,8 @@ class InnovationsFit:
     limited_Q: BoolArray
     limited_R: BoolArray
     at_bounds: BoolArray
+    #: As ``v``, of the variances that are kept away from zero; NaN for all others.
+    avoided: FloatArray
     whitened: FloatArray
     innovations: FloatArray
     variances: FloatArray
@@ -123,14 +126,14 @@ def _information_of_constants(objective: Objective, maximum: Maximum) -> Informa
 
 
 def guarded_maximum(
-    objective: Objective, fits: list[Fit], note: Callable[[str], object], known: FloatArray | None = None
+    objective: Objective, fits: list[Fit], note: Callable[[str], object], known: InnovationsFit | None = None
 ) -> tuple[Maximum, Information]:
     """Return the greatest likelihood, with variances that the log cannot distinguish from zero kept away from it."""
-    maximum = greatest_likelihood(objective, fits, note, known)
+    maximum = greatest_likelihood(objective, fits, note, None if known is None else known.v)
     knowledge = _information_of_constants(objective, maximum)
     if not knowledge.undetermined:
         # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
-        maximum = without_collapse(objective, maximum, note)
+        maximum = without_collapse(objective, maximum, note, None if known is None else known.avoided)
         knowledge = _information_of_constants(objective, maximum)
     return maximum, knowledge
 
@@ -156,23 +159,18 @@ def innovations_fit(
     *,
     exact: CalibrationProblem | None = None,
     known: InnovationsFit | None = None,
-    quick_box: bool = False,
 ) -> tuple[InnovationsFit | None, float]:
-    """Return the fit of the innovations, from fits of the simulation, or near what is ``known`` of it from fewer rows;
-    with a box by deviations where a ``quick_box`` is asked for. With an ``exact`` problem also by how much its
+    """Return the fit of the innovations, from fits of the simulation, or near what is ``known`` of it from fewer rows.
+    With an ``exact`` problem also by how much its
     constants would move; there is no fit where that matters."""
     objective = Objective(problem, fits[0])
-    maximum, knowledge = guarded_maximum(objective, fits, note, None if known is None else known.v)
+    maximum, knowledge = guarded_maximum(objective, fits, note, known)
     moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, knowledge)
     if moved > TOLERATED_MOVE:
         return None, moved
-    variances = int((objective.is_q | objective.is_r).sum())
-    root = quantile(level, len(problem.names), problem.log.samples, variances)
-    if quick_box:
-        sides = quadratic_box(objective, maximum, root, knowledge)
-    else:
-        note("boxes by profile likelihood")
-        sides = profile_box(objective, maximum, root, knowledge, None if known is None else known.sides)
+    note("boxes by profile likelihood")
+    root = _root(objective, level)
+    sides = profile_box(objective, maximum, root, knowledge, None if known is None else known.sides)
     # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
     Q, R = objective.noise(maximum.likeliest)
     limited, limits = _limits(objective, maximum)
@@ -192,11 +190,35 @@ def innovations_fit(
         limited_Q=limited[: len(Q)],
         limited_R=limited[len(Q) :],
         at_bounds=bounds,
+        avoided=avoided_variances(objective, maximum.z),
         whitened=whitened,
         innovations=e,
         variances=spread,
         at_end=_at_end(objective, maximum, knowledge) if has_offsets else None,
     ), moved
+
+
+def box_beside(
+    problem: CalibrationProblem,
+    fits: list[Fit],
+    level: float,
+    note: Callable[[str], object],
+    known: InnovationsFit | None,
+) -> list[tuple[Side, Side]]:
+    """Return the box alone of a model with more states: by profile likelihood, or by deviations near what is
+    ``known``."""
+    objective = Objective(problem, fits[0])
+    maximum, knowledge = guarded_maximum(objective, fits, note, known)
+    root = _root(objective, level)
+    if known is None:
+        return profile_box(objective, maximum, root, knowledge)
+    return quadratic_box(objective, maximum, root, knowledge)
+
+
+def _root(objective: Objective, level: float) -> float:
+    """Return the root of the deviance at the ends of a box."""
+    problem, variances = objective.problem, int((objective.is_q | objective.is_r).sum())
+    return quantile(level, len(problem.names), problem.log.samples, variances)
 
 
 def _at_end(objective: Objective, maximum: Maximum, knowledge: Information) -> tuple[FloatArray, FloatArray]:

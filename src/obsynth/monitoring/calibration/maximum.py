@@ -333,10 +333,13 @@ def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
     return is_collapsed
 
 
-def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str], object]) -> Maximum:
+def without_collapse(
+    objective: Objective, maximum: Maximum, note: Callable[[str], object], known: FloatArray | None = None
+) -> Maximum:
     """Return the maximum with variances kept away from zero where the log cannot tell them from it. The weight sqrt(q)
     of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance that a short log
-    makes zero by chance would make every box too small."""
+    makes zero by chance would make every box too small. The search begins where such a variance is ``known`` to be,
+    as `avoided_variances` of another fit has it, or else at several places."""
     for _ in range(len(objective.problem.noisy) + 1):
         new = collapsed(objective, maximum) & (objective.avoided == 0.0)
         if not new.any():
@@ -344,15 +347,25 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
         note("variances that the log cannot distinguish from zero")
         objective.avoided[new] = 1.0
         best, value = maximum.z, np.inf
-        for raised in RAISED:
+        places = [objective.first[new] + raised for raised in RAISED]
+        if known is not None and np.isfinite(known[objective.free][new]).all():
+            places = [known[objective.free][new]]
+        for place in places:
             start = maximum.z.copy()
-            start[new] = np.clip(objective.first[new] + raised, objective.low[new], objective.high[new])
+            start[new] = np.clip(place, objective.low[new], objective.high[new])
             reached, z = objective.descent(start)
             if reached < value:
                 best, value = z, reached
         value, best, curvature = polished(objective, best)
         maximum = Maximum(best, value, curvature, maximum.likeliest)
     return maximum
+
+
+def avoided_variances(objective: Objective, z: FloatArray) -> FloatArray:
+    """Return ``[t, log q, log r]`` of the variances that are kept away from zero, NaN for all others."""
+    variables = np.full(len(objective.free), np.nan)
+    variables[objective.free] = np.where(objective.avoided > 0.0, z, np.nan)
+    return variables
 
 
 def hessian(

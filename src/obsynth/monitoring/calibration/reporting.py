@@ -203,6 +203,7 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
         limited_Q=nothing.astype(bool),
         limited_R=np.zeros(len(problem.output_names), dtype=bool),
         at_bounds=ends,
+        avoided=np.full(len(start.t) + len(nothing) + len(start.deviations), np.nan),
         whitened=e / start.deviations,
         innovations=e,
         variances=variances,
