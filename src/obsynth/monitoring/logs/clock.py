@@ -52,9 +52,16 @@ class StampError(SpecError):
         super().__init__(message, path=f"row {row}")
         self.row, self.last, self.time = row, last, time
 
-    def dated(self, date_of: Callable[[float], str]) -> str:
-        """Return the message with dates as the log writes them."""
-        return f"Row {self.row}: the time falls from {date_of(self.last)} to {date_of(self.time)}."
+    def dated(self, date_of: Callable[[float], str], *, is_autumn: bool) -> str:
+        """Return the message with dates as the log writes them, and what mends it; ``is_autumn``: dates without a zone
+        have fallen as clocks do then."""
+        mend = (
+            "Clocks go back like this in autumn, and the stamps name no time zone: state it (time_zone, --time-zone "
+            "Europe/Berlin), or sort the log by its time"
+            if is_autumn
+            else "Sort the log by its time"
+        )
+        return f"Row {self.row}: the time falls from {date_of(self.last)} to {date_of(self.time)}. {mend}."
 
 
 class Clock:

@@ -317,7 +317,7 @@ class LogRun:
                 vars(part).update(kept)
             place = f"row {number}"
             if self.stamps is not None and self.stamps.is_dated and isinstance(error, StampError):
-                error.args = (error.dated(self.stamps.shown),)
+                error.args = (error.dated(self.stamps.shown, is_autumn=self.stamps.may_be_autumn),)
             if isinstance(error, SpecError):
                 if error.path == place:
                     raise

@@ -481,10 +481,15 @@ class Stamps:
             self.latest = seconds
         return first
 
+    @property
+    def may_be_autumn(self) -> bool:
+        """Whether dates without a zone have fallen by as much as clocks do in autumn."""
+        return any("clocks go back" in note for note in self.notes)
+
     def _note_of_autumn(self, moment: datetime, seconds: float, row: int) -> None:
         """Say what dates without a zone may be that fall by an hour, as clocks do in autumn."""
         fallen = self.latest - seconds
-        if LEAST_FALL <= fallen <= AUTUMN_FALL and not any("clocks go back" in note for note in self.notes):
+        if LEAST_FALL <= fallen <= AUTUMN_FALL and not self.may_be_autumn:
             before = self.moment(self.latest).isoformat(sep=" ")
             self.notes.append(
                 f"Row {row}: the time falls from {before} to {moment.isoformat(sep=' ')}, as where clocks go back in "
