@@ -358,3 +358,23 @@ def test_units_do_not_decide_whether_there_is_an_observer() -> None:
     assert not any("in units in which" in note for note in obsynth.adaptive_observer(natural).notes)
     kept = obsynth.adaptive_observer(given, Q=design.options["Q"], R=design.options["R"]).options
     np.testing.assert_array_equal(kept["Q"], design.options["Q"])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_parameter_may_be_read_where_no_state_is(seed: int) -> None:
+    # Its regressor is exactly zero: the least-squares problem leaves the rounding of that sensor's own datum.
+    rng = np.random.default_rng([46, seed])
+    n = 1 + seed % 3
+    units = 10.0 ** rng.integers(-4, 5, n + 1)
+    read_alone = np.zeros((n + 1, 2))
+    read_alone[-1, 1] = rng.standard_normal()
+    plant = obsynth.DescriptorSystem(
+        A=0.3 * rng.standard_normal((n, n)),
+        C=units[:, None] * np.vstack([rng.standard_normal((n, n)), np.zeros(n)]),
+        Bf=np.hstack([rng.standard_normal((n, 1)), np.zeros((n, 1))]),
+        Df=units[:, None] * read_alone,
+        Bw=np.eye(n, 2 * n + 1),
+        Dw=np.hstack([np.zeros((n + 1, n)), np.diag(0.1 * units)]),
+        dt=1.0,
+    )
+    assert obsynth.adaptive_observer(plant).report.passed

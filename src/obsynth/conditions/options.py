@@ -37,8 +37,11 @@ def own_terms(method: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
-def own_term_conflicts(method: Any, *, beside: tuple[str, ...], engines: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield what is wrong with these options; ``beside``: options that the plain inequality knows nothing of."""
+def own_term_conflicts(
+    method: Any, *, beside: tuple[str, ...], engines: tuple[str, ...] = (), named_regions: bool = False
+) -> Iterator[str]:
+    """Yield what is wrong with these options; ``beside``: options that the plain inequality knows nothing of;
+    ``named_regions``: regions by name are put into it too."""
     if method.constraints is not None and not callable(method.constraints):
         yield (
             f"constraints is {shown(method.constraints)}: give a function of the variables that returns a list of "
@@ -51,6 +54,8 @@ def own_term_conflicts(method: Any, *, beside: tuple[str, ...], engines: tuple[s
     ):
         yield f"solver_options is {shown(method.solver_options)}: give the solver's settings by name."
     terms = own_terms(method)
+    if named_regions and isinstance(method.region, Mapping):
+        terms += ("region",)
     if not terms:
         return
     listed = " and ".join(terms)

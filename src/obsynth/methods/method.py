@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import field_types, problem_with
+from obsynth.numerics.arguments import field_types, problem_with, without_axes
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.linear.observer import LinearObserver
@@ -137,7 +137,7 @@ class Method(ABC):
                 f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(known)}.{near}",
                 path=OPTIONS_PATH,
             )
-        return cls(**options)
+        return cls(**{name: without_axes(value) for name, value in options.items()})
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

@@ -182,6 +182,13 @@ def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
     return value
 
 
+def without_axes(value: Any) -> Any:
+    """Return the entry of an array without axes, as ``numpy.array(2.0)``, by name too; anything else as it is."""
+    if isinstance(value, Mapping) and any(isinstance(entry, np.ndarray) for entry in value.values()):
+        return {name: without_axes(entry) for name, entry in value.items()}
+    return value.item() if isinstance(value, np.ndarray) and not value.ndim else value
+
+
 def number_in_text(text: str) -> float:
     """Return the number that a text holds; raise `ValueError` where it holds none, as ``1_000`` of Python is none."""
     if "_" in text:

@@ -205,7 +205,8 @@ class FaultEstimationFilter(Method):
             yield f"objective is {shown(self.objective)}: give 'h2', or a function of the variables."
         if self.own_inequality and self.gamma_search == "bisection":
             yield "bisection does not know constraints, objective, region and decay: leave gamma_search out."
-        yield from own_term_conflicts(self, beside=("residual_weight_limit", "prove_least"), engines=("riccati",))
+        beside = ("residual_weight_limit", "prove_least")
+        yield from own_term_conflicts(self, beside=beside, engines=("riccati",), named_regions=True)
         if self.decay is not None and self.engine == "riccati":
             yield "engine 'riccati' imposes no decay: use 'auto' or 'lmi'."
 

@@ -193,7 +193,7 @@ class PdObserver(Method):
         if self.objective is not None and not callable(self.objective):
             yield f"objective is {shown(self.objective)}: give a function of the variables."
         beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
-        yield from own_term_conflicts(self, beside=beside, engines=("riccati",))
+        yield from own_term_conflicts(self, beside=beside, engines=("riccati",), named_regions=True)
         exclusive = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
         clash = [name for name in exclusive if getattr(self, name) is not None]
         if self.adaptation_range is not None and clash:

@@ -7,7 +7,7 @@ import numpy as np
 from obsynth.methods.engines.recursive.consistency import data_deviations, state_terms
 from obsynth.methods.engines.recursive.horizon_proof import natural_units
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank, product_but_rounding
+from obsynth.numerics.ranks import RANK_TOLERANCE, ROUNDED_BESIDE, numerical_rank, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.gain_schedule_summary import looked_at
@@ -67,6 +67,9 @@ def _terms(
     values = np.concatenate([driven, outputs, np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
     nq = upsilon.shape[1]
     regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
+    # A parameter that is read where no state is has a regressor of zero, but for the rounding of that row's datum.
+    rows = np.max(np.abs(np.hstack([step.H, step.noise])), axis=1, keepdims=True)
+    regressors += ROUNDED_BESIDE * rows * np.max(regressors / np.where(rows > 0.0, rows, 1.0), axis=0, initial=0.0)
     return state_terms(step, np.hstack([values[:, None], regressors]))
 
 
