@@ -6,6 +6,7 @@ import inspect
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pytest
 
 import obsynth
@@ -116,3 +117,16 @@ def test_a_gain_set_for_other_constants_than_those_of_the_spec_is_told(tmp_path,
         capsys.readouterr()
         assert main(["evaluate", "--system", spec, "--gains", gains, "--runs", "2", "--quiet"]) == 0
         assert ("(c 0.1 for 0.125): the plant of the gain set is used" in capsys.readouterr().err) is told
+
+
+def test_an_array_without_axes_is_the_number_that_it_holds() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], Bd=[[0.1]], dt=1.0)
+    assert obsynth.fault_estimation_filter(plant, gamma=np.array(0.9)).options["gamma"] == 0.9
+    noisy = plant.replace(Bw=[[0.0]], Dw=[[0.1]])
+    bounds = {"d1": np.array(0.1)}
+    test = obsynth.guaranteed_test(noisy, samples=np.array(8), before=1, disturbance_bounds=bounds, noise_bound=3)
+    assert test.samples == 8
+    with pytest.raises(obsynth.SpecError, match=r"delay is 2\.0"):
+        obsynth.optimal_filter(plant, delay=np.array(2.0))
+    with pytest.raises(obsynth.SpecError, match=r"band is 2\.0"):
+        obsynth.detection_filter(plant, band=np.array(2.0))

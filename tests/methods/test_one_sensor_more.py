@@ -82,3 +82,42 @@ def test_a_decay_is_reached_with_less_noise_than_by_a_gain_of_that_rate(seed: in
     assert 1.0 <= design.certificate.claims["decay"] < 1.3 * max(1.0, plain.certificate.claims["decay"])
     faster = obsynth.ui_pi_observer(plant, decay=2.0)
     assert design.certificate.claims["noise_amplification"] < 0.9 * faster.certificate.claims["noise_amplification"]
+
+
+@pytest.mark.parametrize("ratio", [1.5, -0.3, 1e4])
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_a_copy_in_another_unit_takes_no_fault_filter_away(seed: int, ratio: float) -> None:
+    # The disturbance enters as the fault does: the least is proved for one sensor, not for both with rounded gains.
+    rng = np.random.default_rng([46, seed])
+    c, fault = rng.standard_normal((1, 2)), rng.standard_normal((2, 1))
+    plant = obsynth.DescriptorSystem(
+        A=0.3 * rng.standard_normal((2, 2)), C=np.vstack([c, ratio * c]), Bf=fault, Bd=-2.0 * fault,
+        Dw=np.diag([0.1, abs(0.1 * ratio)]), dt=0.1,
+    )  # fmt: skip
+    alone = obsynth.DescriptorSystem(A=plant.A, C=c, Bf=fault, Bd=plant.Bd, Dw=[[0.1]], dt=0.1)
+    both, one = obsynth.fault_estimation_filter(plant), obsynth.fault_estimation_filter(alone)
+    assert both.certificate.claims["gamma"] <= 1.001 * one.certificate.claims["gamma"]
+
+
+@pytest.mark.parametrize("difference", [1e-12, 1e-8, 1e-4])
+@pytest.mark.parametrize("parallel", [False, True])
+def test_a_copy_but_for_its_last_digits_costs_no_noise_and_no_gain(parallel: bool, difference: float) -> None:
+    # With an unknown input the difference was used: 1e4 times the noise, or a filter that could not be proved.
+    rng = np.random.default_rng([46, 4 - parallel])
+    c, fault = rng.standard_normal((1, 2)), rng.standard_normal((2, 1))
+    A = 0.3 * rng.standard_normal((2, 2))
+    Bd = -2.0 * fault if parallel else rng.standard_normal((2, 1))
+    alone = obsynth.DescriptorSystem(A=A, C=c, Bf=fault, Bd=Bd, Dw=[[0.1]], dt=0.1)
+    near = np.vstack([c, c + difference * rng.standard_normal((1, 2))])
+    both = obsynth.DescriptorSystem(A=A, C=near, Bf=fault, Bd=Bd, Dw=0.1 * np.eye(2), dt=0.1)
+    one, more = obsynth.fault_estimation_filter(alone), obsynth.fault_estimation_filter(both)
+    assert more.certificate.claims["gamma"] <= 1.001 * one.certificate.claims["gamma"]
+    assert deviation_of(more) <= 1.001 * deviation_of(one)
+
+
+def deviation_of(design: obsynth.ObserverDesign) -> float:
+    """Standard deviation of the first fault estimate with white noise of deviation 0.1 on every sensor."""
+    run, noise = design.observer, 0.1 * design.observer.By
+    steady = scipy.linalg.solve_discrete_lyapunov(run.Az, noise @ noise.T)
+    direct, row = 0.1 * run.Dy[run.fault_rows], run.Cz[run.fault_rows]
+    return float(np.sqrt((row @ steady @ row.T + direct @ direct.T)[0, 0]))

@@ -582,3 +582,15 @@ def test_a_sensor_that_shows_its_noise_alone_is_hardly_used() -> None:
         )
         noise.append(obsynth.pd_observer(plant).report["noise in the fault estimate"].value)
     assert noise[1] <= 1.01 * noise[0]
+
+
+@pytest.mark.parametrize(
+    "beside", [{"disk": [1, 20]}, {"gain_bound": 50.0}, {"noise_gain": 50.0}, {"adaptation_gain": 2.0}], ids=str
+)
+@pytest.mark.parametrize(
+    "region", [{"half_plane": 0.1}, obsynth.conditions.half_plane(0.1)], ids=["by name", "as a region"]
+)
+def test_a_region_beside_what_its_inequality_knows_nothing_of_is_refused(region: Any, beside: dict[str, Any]) -> None:
+    plant = obsynth.DescriptorSystem(A=[[-1.0, 0.2], [0.1, -2.0]], C=np.eye(2), Bf=[[1.0], [0.0]])
+    with pytest.raises(obsynth.SpecError, match=f"region cannot be combined with {next(iter(beside))}"):
+        obsynth.pd_observer(plant, region=region, **beside)

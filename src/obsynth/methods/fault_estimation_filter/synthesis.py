@@ -53,6 +53,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.results.design import Certificate
+from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES, least_gain_row
 
 #: Gains that take the outputs.
 _OF_OUTPUTS = ("N", "L", "W", "R")
@@ -64,6 +65,9 @@ WORTH_A_FREE_WEIGHT = 0.05
 MOST_STATES_COMPARED = 8
 
 _PRICES = "What is shipped for each, and its H2 norm from unit noise on each output to the estimates:"
+
+#: So many times the noise is too much for a smaller gain that only a difference between nearly dependent outputs gives.
+MOST_NOISE_FOR_GAIN = 1e4
 
 #: Coordinates in which a certificate is looked for before the gain is judged again.
 FIRST_TRIES = 4
@@ -87,7 +91,7 @@ def synthesise(
     merged = merged_outputs(plant)
     dependent = merged is not None and _is_prepared_without(plant, prepared)
     paper = method.asks_for_free_weight is False
-    near = nearly_merged_outputs(plant) if method.S is None and not plant.nd and not paper else None
+    near = nearly_merged_outputs(plant) if method.S is None and not paper else None
     if merged is None or not dependent:
         made = _synthesised(plant, conditions, prepared, method, progress)
         return made if near is None else _less_noisy(plant, near, made, method, progress)
@@ -111,7 +115,11 @@ def _less_noisy(
     method: FaultEstimationFilter,
     progress: Callable[[str], None],
 ) -> Synthesis:
-    """Return the filter with nearly dependent outputs merged where that exists and is less noisy, else the other."""
+    """Return the filter with nearly dependent outputs merged where that exists and is less noisy, else the other.
+
+    A gain on disturbances that is less by more than the margin is worth noise, but not any: a difference between
+    outputs that are equal but for the last digits of a linearisation decouples nothing of a real plant.
+    """
     conditions, prepared = examine_fault_filter(near.plant)
     if prepared is None or not all(condition.holds for condition in conditions):
         return made
@@ -122,8 +130,10 @@ def _less_noisy(
     if not _is_as_labelled(other):
         # A W that is the paper's of the merged outputs is another left inverse for those as given.
         other = replace(other, options={**other.options, "weight": "free"})
-    merged_deviation = fault_deviation(plant, other.linear_observer)
-    return other if merged_deviation < fault_deviation(plant, made.linear_observer) else made
+    least, gain = other.certificate.claims.get("gamma_min", 0.0), made.certificate.claims.get("gamma", 0.0)
+    price = 1.0 if least <= (1.0 + method.gamma_margin) * gain else MOST_NOISE_FOR_GAIN
+    merged_deviation, deviation = (fault_deviation(plant, one.linear_observer) for one in (other, made))
+    return other if price * merged_deviation < deviation else made
 
 
 def _for_independent_outputs(
@@ -146,12 +156,35 @@ def _is_as_labelled(made: Synthesis) -> bool:
 def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthesis) -> Synthesis:
     """Return the filter of a plant from that of it with merged outputs."""
     observer, weights = synthesis.linear_observer, merged.weights
+    work = with_sensor_faults_as_states(plant)
+    gains = {name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in synthesis.gains.items()}
+    gains["Upsilon"] = work.C @ synthesis.gains["Psi"]
     return replace(
         synthesis,
-        gains={name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in synthesis.gains.items()}
-        | {"Upsilon": with_sensor_faults_as_states(plant).C @ synthesis.gains["Psi"]},
+        gains=gains,
         observer=replace(observer, By=observer.By @ weights, Dy=observer.Dy @ weights, output_names=plant.output_names),
+        certificate=_where_it_holds(synthesis, work, gains),
     )
+
+
+def _where_it_holds(synthesis: Synthesis, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> Certificate:
+    """Return the certificate without a proof of the least gain that does not hold for all outputs: what no gain sees of
+    merged ones may be visible by the rounding of gains that are for all."""
+    certificate = synthesis.certificate
+    if not LEAST_GAIN_WITNESSES & certificate.matrices.keys():
+        return certificate
+    row = least_gain_row(
+        work,
+        gains,
+        certificate.matrices,
+        certificate.claims["gamma_min"],
+        free_weight=synthesis.options["weight"] == "free",
+        thorough=False,
+    )
+    if row.passed:
+        return certificate
+    held = {name: part for name, part in certificate.matrices.items() if name not in LEAST_GAIN_WITNESSES}
+    return replace(certificate, matrices=held)
 
 
 def _is_prepared_without(plant: DescriptorSystem, prepared: PreparedPlant | None) -> bool:
