@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,12 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed
+from obsynth.methods.optimal_filter.fault_maps import (
+    ZERO_GAIN,
+    FaultMap,
+    designed,
+    least_deviation_of_every_start,
+)
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
@@ -331,15 +336,24 @@ def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) ->
 
 def _least_deviation(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     """Compute the least mean square from the plant again: the filtering Riccati equation is the proof."""
-    stated = claimed(design.certificate.claims, "least_deviation")
-    try:
-        least = designed(plant, _claimed_map(design), "h2").gain
-    except PreconditionError:
-        least = np.nan
+    stated, fault_map = claimed(design.certificate.claims, "least_deviation"), _claimed_map(design)
+    of = "every causal linear filter with this fault map"
+    least = _least_or_nan(lambda: designed(plant, fault_map, "h2").gain)
+    if not least * (1.0 + DEVIATION_SHARE) >= stated:
+        every = _least_or_nan(lambda: least_deviation_of_every_start(plant, fault_map, design.options.get("weights")))
+        if every > least or np.isnan(least):
+            least, of = every, f"{of} whose errors decay after any start"
     return lower_bound_check(
         "least deviation",
-        "every causal linear filter with this fault map has at least this root mean square",
+        f"{of} has at least this root mean square",
         least * (1.0 + DEVIATION_SHARE),
         stated,
         source="filtering Riccati equation of the plant, solved again",
     )
+
+
+def _least_or_nan(least: Callable[[], float]) -> float:
+    try:
+        return least()
+    except PreconditionError:
+        return np.nan

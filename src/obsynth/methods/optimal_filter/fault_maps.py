@@ -13,7 +13,7 @@ import scipy.linalg
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.optimal_filter.delays import delays_of
-from obsynth.methods.optimal_filter.lasting_modes import with_lasting_modes_driven
+from obsynth.methods.optimal_filter.lasting_modes import with_growing_modes_reached, with_lasting_modes_driven
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
@@ -63,12 +63,16 @@ class Options(Protocol):
 
 
 class FaultMap(NamedTuple):
-    """What the estimate is of the faults: a delay of each, or a reference model; exact or not; what is weighted."""
+    """What the estimate is of the faults: a delay of each, or a reference model; exact or not; what is weighted.
+
+    ``undriven``: so many last columns of the plant's noise carry none: they only keep the states that they reach.
+    """
 
     delays: tuple[int, ...] | None
     reference: Model | None
     exact: bool
     weights: Weights | None = None
+    undriven: int = 0
 
     @property
     def delay(self) -> int | None:
@@ -216,10 +220,13 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     if not models:
         problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
         weights = (own.faults / units.error)[:, None]
-        return replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
-    a, b, c, d = reduce(in_series, models)
-    scaled = (a, b * each, c / units.error, d * each / units.error)
-    return estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
+        problem = replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
+    else:
+        a, b, c, d = reduce(in_series, models)
+        scaled = (a, b * each, c / units.error, d * each / units.error)
+        problem = estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
+    driving = np.arange(problem.B.shape[1]) < problem.B.shape[1] - fault_map.undriven
+    return replace(problem, B=problem.B * driving, D=problem.D * driving, D1=problem.D1 * driving)
 
 
 def channels_of(plant: DescriptorSystem, fault_map: FaultMap) -> tuple[Channels, FloatArray]:
@@ -301,3 +308,20 @@ def designed(
         least.decays,
         ZERO_GAIN * (1.0 + size) * ratio,
     )
+
+
+def on_plant(plant: DescriptorSystem, fault_map: FaultMap, weights: Any) -> FaultMap:
+    """Return a fault map, with the weights of an option, for the noise of a plant and with all of it."""
+    rows = plant.nf if fault_map.reference is None else len(fault_map.reference[2])
+    own = weights_of(weights, plant, rows=rows, exact=fault_map.exact)
+    return fault_map._replace(weights=own, undriven=0)
+
+
+def least_deviation_of_every_start(plant: DescriptorSystem, fault_map: FaultMap, weights: Any) -> float:
+    """Return the least mean square, its root, of filters whose errors decay whatever the start of undriven modes.
+
+    Those on the boundary of stability cost nothing in the limit of slow decay.
+    """
+    reached, undriven = with_growing_modes_reached(plant)
+    own = on_plant(reached, fault_map, weights)._replace(undriven=undriven)
+    return designed(reached, own, "h2").gain

@@ -3,7 +3,8 @@
 Their part of the error decays only where the filter reads them, which costs noise: where they are on the boundary of
 stability, no stable filter reaches the least gain of all causal ones, and some come as near as one likes.  Beyond it
 (modes that grow) a gap may stay.  The filter is designed as if a little noise drove them, and its claims are those for
-the plant as it is.
+the plant as it is.  The least mean square of filters whose errors decay needs no such noise where modes grow: the
+Riccati equation has a stabilising solution without it.
 """
 
 from __future__ import annotations
@@ -27,9 +28,23 @@ AXIS_SHARE = 1e-6
 
 def with_lasting_modes_driven(plant: DescriptorSystem, drive: float = ADDED_DRIVES[0]) -> DescriptorSystem:
     """Return the plant with noise that drives its lasting modes; as it is where each of them is driven."""
+    return _with_drives(plant, drive, "drive of lasting mode", grows=None)
+
+
+def with_growing_modes_reached(plant: DescriptorSystem, drive: float | None = None) -> tuple[DescriptorSystem, int]:
+    """Return the plant with columns of noise, the last ones, that reach its undriven growing modes, and their count.
+
+    ``drive``: of noise on lasting modes that do not grow; by default none.
+    """
+    driven = plant if drive is None else _with_drives(plant, drive, "drive of lasting mode", grows=False)
+    reached = _with_drives(driven, ADDED_DRIVES[0], "start of growing mode", grows=True)
+    return reached, reached.nw - driven.nw
+
+
+def _with_drives(plant: DescriptorSystem, drive: float, name: str, *, grows: bool | None) -> DescriptorSystem:
     units = PlantUnits.of(plant).rounded()
     left, own = units.equations[:, None], units.states
-    columns = _undriven(left * plant.E * own, left * plant.A * own, left * plant.Bw, discrete=plant.is_discrete)
+    columns = _undriven(left * plant.E * own, left * plant.A * own, left * plant.Bw, plant.is_discrete, grows)
     count = columns.shape[1]
     if not count:
         return plant
@@ -38,19 +53,20 @@ def with_lasting_modes_driven(plant: DescriptorSystem, drive: float = ADDED_DRIV
     return plant.replace(
         Bw=np.hstack([plant.Bw, size * columns / left]),
         Dw=np.hstack([plant.Dw, np.zeros((plant.ny, count))]),
-        noise_names=[*plant.noise_names, *(f"drive of lasting mode {i + 1}" for i in range(count))],
+        noise_names=[*plant.noise_names, *(f"{name} {i + 1}" for i in range(count))],
     )
 
 
-def _undriven(e: FloatArray, a: FloatArray, noise: FloatArray, *, discrete: bool) -> FloatArray:
-    """Return orthonormal columns that drive every lasting mode which the noise does not."""
+def _undriven(e: FloatArray, a: FloatArray, noise: FloatArray, discrete: bool, grows: bool | None) -> FloatArray:
+    """Return orthonormal columns that drive every lasting mode which the noise does not: of all, or as it ``grows``."""
     alpha, beta = scipy.linalg.eigvals(a, e, homogeneous_eigvals=True)
     finite = np.abs(beta) * INFINITE_EIGENVALUE > np.abs(alpha)
     modes = alpha[finite] / beta[finite]
     if discrete:
-        lasting = modes[np.abs(modes) >= STABLE_RADIUS]
+        beyond, edge = np.abs(modes) - 1.0, 1.0 - STABLE_RADIUS
     else:
-        lasting = modes[modes.real >= -AXIS_SHARE * np.max(np.abs(modes), initial=0.0)]
+        beyond, edge = modes.real, AXIS_SHARE * float(np.max(np.abs(modes), initial=0.0))
+    lasting = modes[(beyond >= -edge) & ((grows is None) | ((beyond > edge) == bool(grows)))]
     columns: list[FloatArray] = []
     for mode in lasting[lasting.imag >= 0.0]:
         vectors = scipy.linalg.null_space((a - mode * e).conj().T, rcond=RANK_TOLERANCE)

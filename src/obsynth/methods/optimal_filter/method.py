@@ -114,7 +114,9 @@ class OptimalFilterMethod(Method):
         "least": ClaimMeaning("", "no causal filter with this fault map has a smaller gain", "least gain"),
         "non_causal_limit": ClaimMeaning("", "no delay brings the gain below this", "gain at any delay"),
         "deviation": ClaimMeaning("", "root mean square of the error for white noise of unit intensity", "deviation"),
-        "least_deviation": ClaimMeaning("", "no causal linear filter with this fault map has less", "least deviation"),
+        "least_deviation": ClaimMeaning(
+            "", "no causal linear filter with this fault map and errors that decay has less", "least deviation"
+        ),
         "delay": ClaimMeaning("samples", "by which the fault map is late, at most", "fault map"),
         "order": ClaimMeaning("", "states of the filter", "order"),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import Any, NamedTuple
 
@@ -22,9 +23,15 @@ from obsynth.methods.optimal_filter.fault_maps import (
     designed,
     filter_in_plant_units,
     first_problem,
+    least_deviation_of_every_start,
+    on_plant,
     unit_of_gains,
 )
-from obsynth.methods.optimal_filter.lasting_modes import ADDED_DRIVES, with_lasting_modes_driven
+from obsynth.methods.optimal_filter.lasting_modes import (
+    ADDED_DRIVES,
+    with_growing_modes_reached,
+    with_lasting_modes_driven,
+)
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order
@@ -58,6 +65,8 @@ LASTING_NOTE = (
     "errors do not decay then. This one was found with a little noise on that mode; its claims are for the plant "
     "without it."
 )
+#: A filter forgets modes that last as fast as its deviation is at most this much above the least one.
+FORGETTING_ROOM = 1.01
 #: Significant digits of a bound in words.
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
@@ -79,14 +88,39 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
     except (PreconditionError, SolverError):
         if with_lasting_modes_driven(plant) is plant:
             raise
-    if asked.norm == "h2":
-        raise SolverError(
-            "A mode of the plant does not decay, and no noise drives it: the filter of least mean square from rest may "
-            "ignore it, and its errors do not decay then. The result is inconclusive. State noise that drives it (Bw), "
-            "or take norm hinf."
-        )
     progress("searching the least gain with noise on modes that last")
-    return _with_lasting_modes(plant, asked)
+    return _with_every_start(plant, asked) if asked.norm == "h2" else _with_lasting_modes(plant, asked)
+
+
+def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
+    """Return the filter of least mean square whose errors decay whatever the start of modes that no noise drives.
+
+    Modes that neither decay nor grow have the most noise, of some, that costs little: it sets how fast they are forgot.
+    """
+    lasts = with_growing_modes_reached(plant, ADDED_DRIVES[0])[0].nw > with_growing_modes_reached(plant)[0].nw
+    for drive in ADDED_DRIVES if lasts else (None,):
+        driven, undriven = with_growing_modes_reached(plant, drive)
+        curve, chosen = _chosen(driven, asked, undriven=undriven)
+        own_map = on_plant(plant, chosen.fault_map, asked.weights)
+        least = least_deviation_of_every_start(plant, own_map, asked.weights)
+        made = _made(plant, asked, curve, chosen, searched=driven, least=least if lasts else None)
+        if made.certificate.claims["deviation"] <= FORGETTING_ROOM * least:
+            break
+    notes = [*made.notes[:-1]]
+    from_rest = designed(plant, own_map, "h2").gain
+    if from_rest < least * (1.0 - CLOSED_GAP):
+        notes[0] = notes[0].replace("linear filters", "linear filters whose errors decay after any start,", 1)
+        notes.append(
+            "A mode of the plant grows, and no noise drives it. From rest alone the least deviation is "
+            f"{from_rest:.6g}, of a filter whose errors grow after any other start."
+        )
+    if lasts:
+        notes.append(
+            "A mode of the plant does not decay, and no noise drives it: the slower filters forget an error of it, the "
+            "nearer they come to the least deviation, as near as one likes. This one is for noise on that mode of "
+            f"{drive:g} of the plant's own."
+        )
+    return replace(made, notes=tuple(notes))
 
 
 def _with_lasting_modes(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
@@ -132,10 +166,11 @@ def _made(
     chosen: Designed,
     *,
     searched: DescriptorSystem | None = None,
+    least: float | None = None,
 ) -> Synthesis:
     """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled.
 
-    ``searched``: the plant that the filter was searched for, where noise was added.
+    ``searched``: the plant that the filter was searched for, where noise was added; ``least``: the least deviation.
     """
     fault_map = chosen.fault_map
     own = plant if searched is None else searched
@@ -144,7 +179,10 @@ def _made(
     if asked.order_limit is not None and full > asked.order_limit:
         chosen, follower, observer = _of_low_order(own, chosen, asked.order_limit, full, asked.norm)
     if searched is not None:
+        own_map = on_plant(plant, fault_map, asked.weights)
+        chosen = chosen._replace(fault_map=own_map)
         chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, follower, observer, asked.norm))
+    chosen = chosen if least is None else chosen._replace(least=min(least, chosen.gain))
     matrices, claims = certified(plant, chosen, observer, follower, asked.norm)
     matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
@@ -272,9 +310,13 @@ class _Row(NamedTuple):
         return 0.0 if self.found.is_nothing else self.found.gain
 
 
-def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod) -> tuple[list[_Row], Designed]:
-    """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none."""
+def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod, *, undriven: int = 0) -> tuple[list[_Row], Designed]:
+    """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none.
+
+    ``undriven``: last columns of the noise that carry none.
+    """
     fault_map, _ = first_problem(plant, asked)
+    fault_map = fault_map._replace(undriven=undriven)
     first = designed(plant, fault_map, asked.norm)
     if fault_map.delays is None:
         return [], first
