@@ -19,7 +19,6 @@ import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, remembered
-from obsynth.numerics.gramians import gramian
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.numerics.standard_form import cayley, cayley_point
 from obsynth.observers.linear.modes import poles_of
@@ -248,6 +247,9 @@ def _in_reached_units(system: System, dt: float) -> tuple[tuple[Any, Any, Any, A
 
     Any coordinates give the same proof: in these a nearly is a contraction.
     """
+    # Most designs need none of this.
+    from obsynth.numerics.gramians import gramian
+
     a, b, c, d = (part.content for part in system(ExtendedBall))
     middle_a, middle_b = (np.array([[float(x.mid()) for x in row] for row in part.tolist()]) for part in (a, b))
     middle_b = middle_b.reshape(len(middle_a), -1)
