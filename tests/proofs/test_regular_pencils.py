@@ -7,7 +7,7 @@ import pytest
 
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import cayley, uncayley
-from obsynth.verification.inequalities import prove_norm_by_eigenvalues
+from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 
 Model = tuple[np.ndarray, ...]
 

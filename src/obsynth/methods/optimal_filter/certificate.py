@@ -19,7 +19,8 @@ from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.inequalities import prove_norm, prove_norm_by_eigenvalues
+from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
+from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
 from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit
 

@@ -28,7 +28,8 @@ from obsynth.results.checks import Check, fitting_check, lower_bound_check, uppe
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed, listed_gains
 from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
-from obsynth.verification.inequalities import proof_row, prove_norm, prove_norm_by_eigenvalues, stability_row
+from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
+from obsynth.verification.inequalities import proof_row, prove_norm, stability_row
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
 from obsynth.verification.invisible_faults import (
     LONGEST_DELAY,
