@@ -120,3 +120,20 @@ def test_points_of_another_delay_prove_no_more_than_is_true(designs) -> None:
         claims={"least": designs["delay"].gain},
     )
     assert "least gain" in {check.name for check in obsynth.verify(other).failures}
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_a_least_gain_that_is_small_beside_large_effects_of_faults_is_not_zero(dt: float) -> None:
+    """Of faults in small units, "the least gain is zero" was printed of a filter of gain .05 and a least one of 1e-7."""
+    mode = 0.5 if dt else -1.0
+    plant = obsynth.DescriptorSystem(
+        A=[[mode, 0.2], [0.1, 1.5 * mode]],
+        C=[[1, 0], [0, 1], [1, 1]],
+        Bf=[[1e6], [-3e6]],
+        Bw=np.hstack([0.3 * np.eye(2), np.zeros((2, 3))]),
+        Dw=np.hstack([np.zeros((3, 2)), 0.1 * np.eye(3)]),
+        dt=dt,
+    )
+    design = obsynth.optimal_filter(plant, reference={"bandwidth": 0.7}, exact=False)
+    assert 5e-8 < design.least <= design.gain
+    assert not any("zero" in note or ": 0;" in note for note in design.notes)

@@ -26,7 +26,8 @@ from obsynth.numerics.least_estimation import (
     realised,
     require_stable_filter,
 )
-from obsynth.numerics.standard_form import cayley_point, uncayley
+from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.standard_form import cayley, cayley_point, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
@@ -281,6 +282,9 @@ def designed(
     """
     problem, ratio = problem_of(plant, fault_map), unit_of_gains(plant, fault_map)
     size = float(np.linalg.norm(problem.D1) + np.linalg.norm(problem.L) * np.linalg.norm(problem.B))
+    if not fault_map.exact:
+        # What the reference model does to its faults, beside states that these drive in other units.
+        size = min(size, _reference_gain(plant, fault_map, problem.alpha) / ratio)
     try:
         if norm == "h2" and not plant.is_discrete:
             continuous = least_mean_square(problem)
@@ -308,6 +312,12 @@ def designed(
         least.decays,
         ZERO_GAIN * (1.0 + size) * ratio,
     )
+
+
+def _reference_gain(plant: DescriptorSystem, fault_map: FaultMap, alpha: float) -> float:
+    """Return the gain from the faults to the error without any filter."""
+    model = reduce(in_series, fault_map.setting.models)
+    return float(hinf_norm(*(model if plant.is_discrete else cayley(*model, alpha))).upper)
 
 
 def on_plant(plant: DescriptorSystem, fault_map: FaultMap, weights: Any) -> FaultMap:
