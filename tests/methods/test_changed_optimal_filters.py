@@ -124,7 +124,7 @@ def test_points_of_another_delay_prove_no_more_than_is_true(designs) -> None:
 
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 def test_a_least_gain_that_is_small_beside_large_effects_of_faults_is_not_zero(dt: float) -> None:
-    """Of faults in small units, "the least gain is zero" was printed of a filter of gain .05 and a least one of 1e-7."""
+    """Of faults in small units, "the least gain is zero" was printed of a filter of gain .05, of 1e-7 at least."""
     mode = 0.5 if dt else -1.0
     plant = obsynth.DescriptorSystem(
         A=[[mode, 0.2], [0.1, 1.5 * mode]],

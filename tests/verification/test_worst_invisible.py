@@ -38,7 +38,7 @@ def of_all_signals(plant: obsynth.DescriptorSystem, points: list[complex], sampl
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_worst_directions_prove_what_all_signals_prove(name: str, seed: int) -> None:
     plant, points, samples, setting = problem(name, seed)
-    few = invisible_faults._of_worst_directions(plant, points, samples, setting, 0.0)
+    few = invisible_faults._of_worst_directions(plant, points, samples, setting, np.inf, 0.0)
     assert few == pytest.approx(of_all_signals(plant, points, samples, setting), rel=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_directions_that_are_wrong_prove_less(name: str, monkeypatch: pytest.Mon
         return found._replace(of_points=moved, of_samples=0.0 * found.of_samples + 1.0, ratio=0.0)
 
     monkeypatch.setattr(invisible_faults, "_directions", wrong)
-    bound = invisible_faults._of_worst_directions(plant, points, samples, setting, 0.0)
+    bound = invisible_faults._of_worst_directions(plant, points, samples, setting, np.inf, 0.0)
     assert bound is None or bound <= most * (1.0 + 1e-12)
     # What falls short is proved with all signals.
     assert proved_least(plant, points, samples, setting, level=0.999 * most) >= 0.999 * most

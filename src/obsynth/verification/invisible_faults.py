@@ -43,6 +43,9 @@ LIMIT_SHARE, LONGEST_DELAY = 1e-5, 1000
 #: A bound of the worst direction of each point is taken where it is this near, as a share, to the ratio that double
 #: precision has for it: more would be claimed of no bound.
 SAME_RATIO = 1.0 - 1e-9
+#: One this near the level is taken as well: double precision may have a ratio above every bound, and all directions of
+#: 30 states take half a minute.
+NEAR_LEVEL = 1.0 - 3e-8
 #: Columns of signals that are smaller beside the others, in double precision, are left out.
 DEPENDENT_SHARE = 1e-12
 #: Dependent equations of last samples with more unknowns than this are not solved in rational numbers.
@@ -121,7 +124,7 @@ def proved_least(
     if not all(_grows(flint.acb(point), plant) for point in points):
         return None
     samples = samples if plant.is_discrete else 0
-    bound = _of_worst_directions(plant, points, samples, setting, level if enough is None else enough)
+    bound = _of_worst_directions(plant, points, samples, setting, level, level if enough is None else enough)
     if bound is not None:
         return bound
     for bits in PRECISION_BITS:
@@ -136,9 +139,9 @@ def proved_least(
 
 
 def _of_worst_directions(
-    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, enough: float
+    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, level: float, enough: float
 ) -> float | None:
-    """Return the proved ratio of one direction of each point, where it is enough, or near that of all directions."""
+    """Return the proved ratio of one direction of each point, where it is enough, or near the level or the best one."""
     try:
         directions = _directions(plant, points, samples, setting)
         if directions is None:
@@ -147,7 +150,7 @@ def _of_worst_directions(
             bound = _Trajectories(plant, points, samples, setting, directions=directions).bound(None, 0.0)
     except (ZeroDivisionError, np.linalg.LinAlgError):
         return None
-    needed = enough if enough > 0.0 else directions.ratio * SAME_RATIO
+    needed = enough if enough > 0.0 else min(directions.ratio * SAME_RATIO, level * NEAR_LEVEL)
     return bound if bound is not None and bound >= needed else None
 
 
