@@ -266,3 +266,28 @@ def test_modes_that_no_gain_moves_are_computed_only_where_a_row_fails_without_th
         assert [row.name for row in rows] == ["requested decay", "requested region"]
         assert all(row.passed for row in rows)
         assert len(calls) == count
+
+
+@pytest.mark.parametrize("method", ["fault-estimation-filter", "guaranteed-test"])
+def test_shapes_of_arrays_are_counts(method: str) -> None:
+    """A length that is filled in by whoever reads the file, or that is no whole number, is none."""
+    for path in places_of_arrays(document_of(method)["design"]):
+        edited = copy.deepcopy(document_of(method))
+        holder = edited["design"]
+        for key in path:
+            holder = holder[key]
+        shape = holder["shape"]
+        for place, length in enumerate(shape):
+            for other in (-1, float(length), True if length == 1 else str(length)):
+                holder["shape"] = [*shape[:place], other, *shape[place + 1 :]]
+                edited["sha256"] = digest_of(edited["design"])
+                with pytest.raises(obsynth.SpecError):
+                    loaded(json.dumps(edited).encode())
+
+
+def places_of_arrays(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if isinstance(tree, dict) and tree.keys() == {"shape", "data"}:
+        yield path
+    elif isinstance(tree, (dict, list)):
+        for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            yield from places_of_arrays(value, (*path, key))

@@ -208,6 +208,9 @@ def restored(value: Any, arrays: Mapping[str, FloatArray] | None = None) -> Any:
             data = [restored(item) for item in value["data"]]
             if not {type(item) for item in data} <= {float, int}:
                 raise TypeError("an array holds something that is no number")
+            # A length of -1 is whatever fits, for numpy.
+            if not all(type(length) is int and length >= 0 for length in value["shape"]):
+                raise ValueError("an array has a shape that is none")
             return np.array(data, dtype=np.float64).reshape(value["shape"])
         if value.keys() == _MEMBER and arrays is not None:
             return arrays[value["member"]]
