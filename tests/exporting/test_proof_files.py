@@ -8,7 +8,9 @@ import json
 import subprocess
 import sys
 import tomllib
+from fractions import Fraction
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -203,6 +205,77 @@ def test_gains_of_random_optimal_filters_are_proved(seed: int) -> None:
     file = json.loads(proof_bytes(proof_of(design)))
     assert not refused(file)
     assert {"gain", "faults"} <= {claim["claim"] for claim in file["claims"]}, file["not_covered"]
+
+
+@pytest.mark.parametrize("prior", [0, 1, 3])
+def test_equations_before_the_window_are_those_of_the_plant(prior: int) -> None:
+    """Whatever the plant does from ``prior`` samples before the window on satisfies every row, and no row is empty."""
+    module, file = program(), proof("guaranteed-test")
+    (question,) = (claim["window"] for claim in file["claims"] if claim["claim"] == "threshold")
+    nothing = as_data(np.zeros((1, 1)))
+    bounds = {name: [None if bound is None else nothing for bound in each] for name, each in question["bounds"].items()}
+    question |= {"samples": 3, "prior": prior, "equations": prior + 2, "bounds": bounds}
+    window, matrices = module.Window(module.System(file), question), (SAMPLED.A, SAMPLED.C)
+    a, c = ([[Fraction(value) for value in row] for row in matrix.tolist()] for matrix in matrices)
+    x = [Fraction(3), Fraction(-1, 2), Fraction(1, 7)]
+    course, seen = [Fraction(0), *x], []
+    for k in range(-prior, 3):
+        seen += [sum(p * q for p, q in zip(row, x, strict=True)) for row in c] if k >= 0 else []
+        x = [sum(p * q for p, q in zip(row, x, strict=True)) for row in a]
+        course += x if k < 2 else []
+    sums: dict[int, Fraction] = {}
+    for row, column, value in window.entries:
+        known = course[column] if column < len(course) else 0
+        sums[row] = sums.get(row, Fraction(0)) + value * known
+    equations = (prior + 2) * len(a)
+    assert [sums[row] for row in range(window.row_count)] == [0] * equations + seen
+
+
+def test_a_test_may_be_proved_with_equations_that_it_does_not_need() -> None:
+    """Weights of the oldest samples are compared where the window begins before them, and others are refused."""
+    file = proof("guaranteed-test")
+    (claim,) = (claim for claim in file["claims"] if claim["claim"] == "threshold")
+    claim["window"] |= {"prior": 2, "equations": claim["window"]["equations"] + 2}
+    claim["multipliers"]["numerators"] = [0] * 2 * SAMPLED.nx + claim["multipliers"]["numerators"]
+    file["claims"] = [claim]
+    assert not refused(file)
+    # What reaches the row of the oldest sample alone: the last state of a chain of samples.
+    By = as_array(file["observer"]["By"])
+    oldest = np.flatnonzero(np.abs(By).max(axis=1))
+    for row in oldest:
+        changed = copy.deepcopy(file)
+        changed["observer"]["By"] = as_data(np.where(np.arange(len(By))[:, None] == row, 1.01 * By, By))
+        assert "weights" in refused(changed), row
+
+
+@pytest.mark.parametrize("lag", [0, 1, 2])
+def test_the_extended_state_is_the_past_and_the_model(lag: int) -> None:
+    """What an observer with a fault model and a lag follows: the plant's equations, shifted states, and the model's."""
+    file, n = proof("ui-pi-observer"), SAMPLED.nx
+    follows = file["follows"]
+    phi, cw = (as_array(follows[name]) for name in ("Phi", "Cw"))
+    count, past = len(phi), lag * n
+    for name in ("T", "T0"):
+        part = as_array(follows[name])
+        between = np.zeros((len(part), past))
+        follows[name] = as_data(np.hstack([part[:, :n], between, part[:, n:]]))
+    follows["lag"] = lag
+    file["observer"]["rows"] = [[kind, name, lag * (kind == "state")] for kind, name, _ in file["observer"]["rows"]]
+    system = program().System(file)
+    found = {name: as_array({"size": [m.rows, m.columns], "exponent": m.exponent, "entries": [*chain(*m.entries)]})
+             for name, m in (("Ea", system.Ea), ("Aa", system.Aa), ("Ca", system.Ca))}  # fmt: skip
+    a = np.zeros((n + past + count, n + past + count))
+    a[:n, :n], a[:n, n + past :], a[n + past :, n + past :] = SMALL.A, SMALL.Bf @ cw, phi
+    a[n : n + past, :past] = np.eye(past)
+    np.testing.assert_array_equal(found["Aa"], a)
+    np.testing.assert_array_equal(found["Ea"], np.eye(len(a)))
+    np.testing.assert_array_equal(found["Ca"], np.hstack([SMALL.C, np.zeros((SMALL.ny, past)), SMALL.Df @ cw]))
+
+
+def test_a_call_without_a_file_says_how_it_is_called() -> None:
+    found = subprocess.run([sys.executable, "-I", str(CHECKER)], capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert "usage" in found.stderr
 
 
 def test_the_program_imports_nothing_but_the_standard_library() -> None:
