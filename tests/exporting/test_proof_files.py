@@ -272,6 +272,41 @@ def test_the_extended_state_is_the_past_and_the_model(lag: int) -> None:
     np.testing.assert_array_equal(found["Ca"], np.hstack([SMALL.C, np.zeros((SMALL.ny, past)), SMALL.Df @ cw]))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"course": "ramp"}, {"course": "ramp", "lag": 2}, {"course": "rate", "fault_rate": 0.05},
+        {"course": "rate", "fault_rate": 0.05, "lag": 3}, {"course": "step", "before": 3},
+        {"course": "any", "lag": 1, "state_bounds": {"x1": 1.0, "x2": 1.0, "x3": 1.0}},
+        {"disturbance": "held"}, {"disturbance": "rate", "disturbance_rate": {"d1": 0.01}},
+        pytest.param({"norm": "ellipsoid", "samples": 3}, marks=pytest.mark.long),
+        {"state_bounds": {"x1": 0.2, "x3": 0.1}},
+        {"initial_bounds": {"x1": 0.1, "x2": 0.1, "x3": 0.1}}, {"disturbance_bounds": {"d1": [-0.02, 0.08]}},
+        {"Df": [[0.2], [1.0]]}, {"Dd": [[0.0], [0.4]]},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_whatever_the_fault_and_the_disturbance_do(options: dict[str, Any]) -> None:
+    """The program forms the equations of each question itself: it accepts what is proved, and nothing a little more."""
+    plant = SAMPLED.replace(**{name: options[name] for name in ("Df", "Dd") if name in options})
+    options = {**TEST, **{name: value for name, value in options.items() if name not in ("Df", "Dd")}}
+    file = json.loads(proof_bytes(proof_of(obsynth.design(plant, "guaranteed-test", **options))))
+    assert not refused(file)
+    claims = {claim["claim"]: claim for claim in file["claims"]}
+    assert {"threshold", "least"} >= set(claims) >= {"threshold"}
+    for name, share in (("threshold", 0.999), ("least", 1.001)):
+        for claim in (claims[name],) if name in claims else ():
+            changed = {**claim, name: as_data(share * as_array(claim[name]))}
+            assert refused({**file, "claims": [changed]})
+    # The same numbers prove nothing of another course of the fault, or of disturbances that may do more.
+    window = claims["threshold"]["window"]
+    for name, other in (("course", "any"), ("disturbance", "any"), ("lag", window["lag"] + 1)):
+        changed = {**claims["threshold"], "window": {**window, name: other}}
+        same = window[name] == other or (name == "lag" and window["course"] not in ("ramp", "any"))
+        same = same or (name == "disturbance" and window[name] == "jump")
+        assert same or refused({**file, "claims": [changed]}), name
+
+
 def test_a_call_without_a_file_says_how_it_is_called() -> None:
     found = subprocess.run([sys.executable, "-I", str(CHECKER)], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (2, "")
