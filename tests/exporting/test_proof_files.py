@@ -307,6 +307,38 @@ def test_whatever_the_fault_and_the_disturbance_do(options: dict[str, Any]) -> N
         assert same or refused({**file, "claims": [changed]}), name
 
 
+def test_numbers_are_printed_on_the_side_that_is_proved() -> None:
+    """Upper bounds are rounded upwards and lower ones downwards, to four digits, whatever their size and sign."""
+    module, rng = program(), np.random.default_rng(46)
+    for _ in range(300):
+        value = Fraction(int(rng.integers(1, 2**62)), int(rng.integers(1, 2**62)))
+        value *= Fraction(10) ** int(rng.integers(-30, 30)) * int(rng.choice([-1, 1]))
+        below, above = Fraction(module.shown(value, down=True)), Fraction(module.shown(value))
+        assert below <= value <= above
+        assert above - below <= abs(value) / 1000
+    assert module.shown(Fraction(0)) == "0"
+
+
+@pytest.mark.parametrize("value", [True, False, None, 1.5, [1], {}, "x", "0.5", "1g", "-", ""], ids=repr)
+def test_what_is_no_integer_is_refused(value: Any) -> None:
+    module = program()
+    assert (module.read_integer(-7), module.read_integer("-1f")) == (-7, -31)
+    with pytest.raises((module.Refused, *module.UNREADABLE)):
+        module.read_integer(value)
+
+
+def test_a_fault_that_rounding_hides_is_no_estimate() -> None:
+    """A larger bound is a weaker claim, but not of the fault's own model: there an estimate may miss a thousandth."""
+    for size, accepted in ((0.9e-3, True), (1.1e-3, False)):
+        file = proof("ui-pi-observer")
+        (claim,) = (claim for claim in file["claims"] if claim["claim"] == "rounding")
+        bounds = as_array(claim["bounds"]["states"])
+        (row,) = (i for i, (kind, _, _) in enumerate(file["observer"]["rows"]) if kind == "fault")
+        bounds[row, SMALL.nx] = size
+        claim["bounds"]["states"] = as_data(bounds)
+        assert (refused(file) == "") == accepted
+
+
 def test_a_call_without_a_file_says_how_it_is_called() -> None:
     found = subprocess.run([sys.executable, "-I", str(CHECKER)], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (2, "")
