@@ -321,6 +321,27 @@ def test_continuous_designs_hold_for_disturbances_that_move_between_samples(cont
         )  # fmt: skip
 
 
+def test_the_first_input_of_a_continuous_design_counts_once(continuous) -> None:
+    """A sample at a time gives what the whole record gives, and the first input, whatever it is, is in both."""
+    monitor = obsynth.online_monitor(
+        continuous, constants=continuous.plant, disturbance_bounds={"load": 0.1}, sample_time=STEP,
+        initial_set=dict.fromkeys(continuous.plant.state_names, START),
+    )  # fmt: skip
+    bound = monitor.rule.plan.bound
+    assert bound.first is not None
+    assert bound.first.any()
+    generator = np.random.default_rng(1)
+    sizes = (bound.drive.shape[-1] - 1, 1, 2)
+    estimates, u, y = (generator.normal(size=(1, 12, n)) for n in sizes)
+    record = thresholds_of_records(bound, estimates, u, y)
+    state = AdaptiveState.of(bound)
+    for k in range(12):
+        state, found = adaptive_step(bound, state, estimates[0, k], u[0, k], y[0, k])
+        assert found.total == pytest.approx(record.total[0, k], rel=1e-12)
+    u[0, 0] *= 3.0
+    assert (thresholds_of_records(bound, estimates, u, y).total[0, 1:] != record.total[0, 1:]).any()
+
+
 def test_records_and_rows_of_continuous_designs_agree(continuous) -> None:
     plant, _ = continuous.linear
     scenario = obsynth.Scenario(horizon=3, sample_time=STEP, disturbances={"load": obsynth.Uniform(low=-0.1, high=0.1)})

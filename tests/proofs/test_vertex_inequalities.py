@@ -9,7 +9,7 @@ import pytest
 
 from obsynth.conditions import ErrorPolytope
 from obsynth.methods.engines.vertex_certificates import certified
-from obsynth.proofs.vertex_inequalities import Witness, prove_gain, prove_mean_square, prove_nonsingular
+from obsynth.proofs.vertex_inequalities import Witness, _place, prove_gain, prove_mean_square, prove_nonsingular
 
 _ERRORS = ErrorPolytope(
     [[[0.5, 0.2], [0, 0.7]], [[0.6, -0.2], [0.1, 0.8]]], [[1.0, 0]], B=[[1.0, 0], [0.5, 0]], D=[[0, 0.3]]
@@ -81,3 +81,10 @@ def test_a_mean_square_needs_a_matrix_that_bounds_the_outputs(discrete: bool, po
     assert prove_mean_square(closed, enough, np.sqrt(1.02 * least), discrete=discrete).proved
     assert not prove_mean_square(closed, small, np.sqrt(1.02 * least), discrete=discrete).proved
     assert not prove_mean_square(closed, enough, np.sqrt(1.0 * least), discrete=discrete).proved
+
+
+def test_places_are_named_by_their_vertices() -> None:
+    first, second, between = np.eye(2)[0], np.eye(2)[1], np.array([0.25, 0.75])
+    assert _place(second, second) == "vertex 2"
+    assert _place(first, second) == "vertex 1, then 2"
+    assert _place(between, first) == "vertex 0.25 of 1 + 0.75 of 2, then 1"
