@@ -339,6 +339,27 @@ def test_a_fault_that_rounding_hides_is_no_estimate() -> None:
         assert (refused(file) == "") == accepted
 
 
+def test_a_fault_that_is_followed_to_more_than_a_thousandth_is_no_estimate() -> None:
+    for size, accepted in ((0.9e-3, True), (1.1e-3, False)):
+        file = proof("functional-filter")
+        (claim,) = (claim for claim in file["claims"] if claim["claim"] == "fault models")
+        bounds = as_array(claim["bounds"])
+        (row,) = (i for i, (kind, _, _) in enumerate(file["observer"]["rows"]) if kind == "fault")
+        bounds[row] = size * np.abs(as_array(claim["Cw"])[0])
+        claim["bounds"] = as_data(bounds)
+        assert (refused(file) == "") == accepted
+
+
+def test_noise_of_a_sample_in_an_ellipsoid_does_no_more_than_in_its_box() -> None:
+    """What is proved for the box is proved for the ellipsoid inside, of one signal with nothing to spare."""
+    file = proof("guaranteed-test")
+    (claim,) = (claim for claim in file["claims"] if claim["claim"] == "threshold")
+    claim["window"]["norm"] = "ellipsoid"
+    assert not refused({**file, "claims": [claim]})
+    claim["threshold"] = as_data(0.5 * as_array(claim["threshold"]))
+    assert refused({**file, "claims": [claim]})
+
+
 def test_a_call_without_a_file_says_how_it_is_called() -> None:
     found = subprocess.run([sys.executable, "-I", str(CHECKER)], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (2, "")
