@@ -8,7 +8,7 @@ from flint import fmpq, fmpq_mat
 
 from obsynth.numerics.spectra import noise_covariance
 from obsynth.proofs import covariances as products
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs.covariances import certain_noise_covariance, enclosed_noise_covariance
 
 
 def far_from_normal(steep: float) -> np.ndarray:
@@ -70,3 +70,16 @@ def test_a_variance_of_rounding_is_not_named(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_is_not_stable_has_an_infinite_variance() -> None:
     found = certain_noise_covariance(np.eye(2), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)), 0.1)
     assert np.all(np.isinf(found))
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_noise_that_passes_at_once_counts_in_samples_alone(dt: float) -> None:
+    a = far_from_normal(0.1)
+    a = a if dt else a - 4.0 * np.eye(6)
+    rng = np.random.default_rng(3)
+    b, c, d = rng.normal(size=(6, 2)), rng.normal(size=(2, 6)), 5.0 * rng.normal(size=(2, 2))
+    enclosed = enclosed_noise_covariance(a, b, c, d, dt)
+    assert enclosed is not None
+    np.testing.assert_allclose(enclosed, noise_covariance(a, b, c, d, dt), rtol=1e-9)
+    without = enclosed_noise_covariance(a, b, c, 0.0 * d, dt)
+    np.testing.assert_allclose(enclosed - without, d @ d.T if dt else 0.0 * d, atol=1e-9)

@@ -88,3 +88,11 @@ def test_places_are_named_by_their_vertices() -> None:
     assert _place(second, second) == "vertex 2"
     assert _place(first, second) == "vertex 1, then 2"
     assert _place(between, first) == "vertex 0.25 of 1 + 0.75 of 2, then 1"
+
+
+@pytest.mark.parametrize("weights", [[-0.5, 1.5], [1.0], [0.5, 0.25, 0.25], [0.5, 0.25], [np.nan, 1.0]], ids=str)
+def test_weights_are_those_of_the_simplex(weights: list[float]) -> None:
+    right, wrong, eye = np.array([0.5, 0.5]), np.array(weights), np.eye(2)
+    assert Witness([eye], [eye], pairs=[(right, right)]).problem(2) == ""
+    for pair in ((right, wrong), (wrong, right)):
+        assert "weights" in Witness([eye], [eye], pairs=[pair]).problem(2)

@@ -112,10 +112,10 @@ class Witness:
     def _pairs_problem(self, count: int) -> str:
         for now, then in self.pairs_of(count):
             for weights in (now, then):
-                if np.shape(weights) != (count,) or (np.asarray(weights) < 0.0).any():
+                if np.shape(weights) != (count,) or not (np.asarray(weights) >= 0.0).all():
                     return f"weights are not {count} numbers of the simplex"
                 # Sums of weights are exact where they are halves, quarters and so on; a pair is data, not a result.
-                if abs(float(np.sum(weights)) - 1.0) > count * np.finfo(np.float64).eps:
+                if not abs(float(np.sum(weights)) - 1.0) <= count * np.finfo(np.float64).eps:
                     return "weights do not add up to one"
         mixed = any(np.count_nonzero(now) > 1 for now, _ in self.pairs_of(count))
         if mixed and (self.G is None or len(self.G) > 1):
