@@ -140,3 +140,9 @@ def test_poles_are_no_request_of_an_observer_that_changes_with_the_scheduling() 
     for name, value in (("region", [{"disk": [0.0, 0.1]}]), ("region", "x")):
         edited = dataclasses.replace(over_region, options={**over_region.options, name: value})
         assert not obsynth.verify(edited).passed
+
+
+def test_the_margin_of_a_condition_is_its_distance_from_its_bound() -> None:
+    rows = [row for row in obsynth.verify(design()).checks if row.kind == "condition" and np.isfinite(row.bound)]
+    assert any(row.value and row.bound for row in rows)
+    assert all(row.margin == abs(row.bound - row.value) for row in rows)
