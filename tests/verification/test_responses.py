@@ -11,6 +11,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.transformations.uncertain_plant import affine_plant
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
+from obsynth.verification.over_tolerances.plants_of_the_box import _summed_response
 from obsynth.verification.over_tolerances.responses import largest_factor, loop_radius, responses_of, ring_length
 
 #: What contraction of the ring and rounding may add to a sum, relatively.
@@ -136,3 +137,9 @@ def test_a_late_fault_has_the_constants_of_its_own_sample(varying: bool) -> None
     *now, earlier = np.abs(found.state.parts[:, 2, 1])
     assert earlier == pytest.approx(0.2)
     assert now == ([0.0] if varying else [])
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.99, -0.99])
+def test_a_slow_response_is_summed_over_all_blocks(pole: float) -> None:
+    found = _summed_response(np.array([[pole]]), np.array([[2.0, -1.0]]), np.array([[3.0]]))
+    assert found[0] == pytest.approx(9.0 / (1.0 - abs(pole)), rel=1e-3)
