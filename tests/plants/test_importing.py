@@ -61,6 +61,18 @@ def test_a_descriptor_system_from_control_takes_its_own_e():
     assert np.array_equal(obsynth.from_control(control.ss(A, B, C, D), E=singular).E, singular)
 
 
+def test_what_is_no_system_of_python_control_is_named_with_what_reads_it():
+    pytest.importorskip("control")
+    with pytest.raises(SpecError, match="from_scipy reads it"):
+        obsynth.from_control(scipy.signal.lti([1.0], [1.0, 1.0]))
+
+
+def test_a_static_gain_is_named():
+    control = pytest.importorskip("control")
+    with pytest.raises(SpecError, match="a static gain"):
+        obsynth.from_control(control.ss([], [], [], [[3.0]]))
+
+
 def test_state_spaces_of_scipy():
     plant = obsynth.from_scipy(scipy.signal.StateSpace(A, B, C, D), input_names=["a", "b", "c"], faults=["c"])
     assert plant.input_names == ("a", "b")

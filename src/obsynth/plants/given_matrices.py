@@ -125,6 +125,12 @@ def plant_fields(
     a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
+    if a.shape == (0, 0):
+        raise SpecError(
+            "A is 0 by 0: a plant without states (a static gain) has nothing to estimate. Give it a state, such as the "
+            "lag of a sensor.",
+            path="A",
+        )
     if nx == 0 or a.shape[1] != nx:
         raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))

@@ -95,6 +95,11 @@ def from_control(
     [[-1.0]]
     """
     control = imported("control", extra=None)
+    if type(system).__module__.startswith("scipy."):
+        raise SpecError(
+            f"system is a {type(system).__name__} of scipy: from_scipy reads it, and from_control those of control.",
+            path="system",
+        )
     require_kind(
         system,
         (control.StateSpace, control.TransferFunction),
