@@ -158,7 +158,7 @@ def effects(name: str, rows: np.ndarray, u: np.ndarray, target: int, row: int) -
     psi = np.zeros((bound.counts[0], nz))
     for k in range(target):
         psi = psi @ bound.structure.Az.T + bound.drive[:, :nz] @ v[k]
-    return np.asarray((bound.drive[:, nz:] @ v[target] + psi @ bound.shown.T)[:, channel_rows + row])
+    return np.asarray((bound.drive[:, nz:] @ v[target] + psi @ bound.output_rows.T)[:, channel_rows + row])
 
 
 def effects_by_sample(name: str, rows: np.ndarray, u: np.ndarray, target: int, row: int) -> np.ndarray:
@@ -168,7 +168,7 @@ def effects_by_sample(name: str, rows: np.ndarray, u: np.ndarray, target: int, r
     v = np.hstack([rows @ bound.structure.reading.T, u])
     found = np.zeros((STEPS, p))
     found[target] = (bound.drive[:, nz:] @ v[target])[:, channel_rows + row]
-    left = bound.shown[channel_rows + row]
+    left = bound.output_rows[channel_rows + row]
     for k in range(target - 1, -1, -1):
         found[k] = bound.drive[:, :nz] @ v[k] @ left
         left = left @ bound.structure.Az

@@ -121,16 +121,16 @@ def _conditions_of_design(design: Any) -> Any:
     return conditions_of(design)
 
 
-def _design_of_conditions(source: str, *given: Any) -> Any:
+def _design_of_conditions(source: str, *arguments: Any) -> Any:
     from obsynth.methods.engines.designs_of_conditions import design_of
 
-    return design_of(source, *given)
+    return design_of(source, *arguments)
 
 
-def _problem_of_options(*given: Any) -> Any:
+def _problem_of_options(*arguments: Any) -> Any:
     from obsynth.methods.engines.designs_of_conditions import problem_of_options
 
-    return problem_of_options(*given)
+    return problem_of_options(*arguments)
 
 
 def _summary_of_design(design: Any) -> Any:
@@ -151,16 +151,16 @@ def _bound_of_monitor(monitor: Any, observer: Any) -> Any:
     return bound_of_monitor(monitor, observer)
 
 
-def _page_sections_of_run(*given: Any) -> Any:
+def _page_sections_of_run(*arguments: Any) -> Any:
     from obsynth.monitoring.page_sections import page_sections_of_run
 
-    return page_sections_of_run(*given)
+    return page_sections_of_run(*arguments)
 
 
-def _detections(*given: Any) -> Any:
+def _detections(*arguments: Any) -> Any:
     from obsynth.monitoring.page_sections import detections
 
-    return detections(*given)
+    return detections(*arguments)
 
 
 def _run_many(options: Any) -> int:

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from obsynth.errors import SpecError
-from obsynth.plants.noise import SensorNoise, kept_share, process_variance, seconds, sensor_noises
+from obsynth.plants.noise import SensorNoise, process_variance, seconds, sensor_noises, successive_correlation
 
 
 def test_times_and_sizes() -> None:
@@ -27,7 +27,7 @@ def test_times_and_sizes() -> None:
 
 def test_coloured_noise_keeps_its_share_and_its_variance() -> None:
     """A sample of one correlation keeps 1 / e; what is added to it is the rest of the variance."""
-    assert kept_share(2.0, 2.0, "exact") == pytest.approx(math.exp(-1.0))
+    assert successive_correlation(2.0, 2.0, "exact") == pytest.approx(math.exp(-1.0))
     assert process_variance(9.0, 2.0, 2.0, "exact") == pytest.approx(9.0 * (1.0 - math.exp(-2.0)))
 
 

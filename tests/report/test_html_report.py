@@ -319,5 +319,5 @@ def test_a_log_without_a_rule_for_alarms_is_not_said_to_be_free_of_them(continuo
         log[name] = 0.0
     run = obsynth.run_on_data(continuous, log)
     text = html_report(continuous, tmp_path / "page.html", run=run).read_text(encoding="utf-8")
-    assert 'class="verdict undecided">40 rows, and no rule for alarms' in text
+    assert 'class="verdict undecided">40 rows; no alarm rule is set' in text
     assert "No alarm" not in text

@@ -20,7 +20,6 @@ from obsynth.plants.implicit_step import ImplicitStep
 #: A start and one step.
 FEWEST_SAMPLES = 2
 
-
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
 

@@ -74,7 +74,14 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     Returns
     -------
     Structure
-        Never raises for a strange plant: a singular one has ``regular`` False.
+        A plant whose pencil is singular has ``regular`` False.
+
+    Raises
+    ------
+    SpecError
+        ``plant`` is neither a `DescriptorSystem` nor a `Transformation`.
+    PreconditionError
+        It is continuous and has delays.
 
     Notes
     -----

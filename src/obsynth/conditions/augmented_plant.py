@@ -202,7 +202,7 @@ def realise(
     return observer, letters
 
 
-def combinations_seen(plant: DescriptorSystem) -> FloatArray:
+def measured_combinations(plant: DescriptorSystem) -> FloatArray:
     """Return the combinations of outputs that no disturbance reaches directly, each of unit length."""
     if not plant.Dd.any():
         return np.eye(plant.ny)

@@ -39,7 +39,7 @@ from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
-LEFT_TO_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
+DECIDED_BY_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
 
 #: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
 PD_MARGIN = 1e-3
@@ -174,7 +174,7 @@ def _theorem(
     safe = chosen(reading, "reading", ("safe", "printed")) == "safe"
     own = linear_plant(plant)
     conditions = pd_observer_conditions(own)
-    require_data(conditions, solvers=LEFT_TO_THE_PD_INEQUALITY)
+    require_data(conditions, solvers=DECIDED_BY_THE_PD_INEQUALITY)
     form = explicit_form(own.dense())
     work = own.dense() if form is None else form.plant
     A_o, C_o = _augmented(work)

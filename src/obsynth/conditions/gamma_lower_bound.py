@@ -34,7 +34,6 @@ from obsynth.verification.least_gain_proof import (
 #: An invariant zero must have a modulus above one by this much to count as growing.
 GROWTH_MARGIN = 1e-6
 
-
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.
 DUAL_MARGIN = 1e-8

@@ -30,7 +30,6 @@ SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
     "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 20_000},
 }
 
-
 #: What cvxpy itself takes beside a solver's own settings.
 _SETTINGS_OF_CVXPY = {"canon_backend", "ignore_dpp", "use_quad_obj", "verbose", "warm_start"}
 

@@ -209,7 +209,7 @@ class _Forms:
     Y: list[Any]
     slack: bool
     pairs: list[Pair] | None
-    given_gains: Sequence[FloatArray] | None
+    fixed_gains: Sequence[FloatArray] | None
     t: Any
 
     @classmethod
@@ -244,7 +244,7 @@ class _Forms:
     def variables(self) -> dict[str, Any]:
         """Return the variables by name."""
         variables: dict[str, Any] = {}
-        for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.given_gains is None else ())):
+        for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.fixed_gains is None else ())):
             variables |= {part.name(): part for part in matrix.variables()}
         return variables | ({"t": self.t} if self.t is not None else {})
 
@@ -353,10 +353,10 @@ class _Forms:
         slack = list(dict.fromkeys(self.G)) if self.slack else []
         for i, G in enumerate(slack):
             matrices[f"G[{i + 1}]" if len(slack) > 1 else "G"] = np.asarray(G.value)
-        if self.given_gains is not None:
+        if self.fixed_gains is not None:
             return (
                 matrices
-                | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(self.given_gains)}
+                | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(self.fixed_gains)}
                 | self._multiplier(values)
             )
         known: dict[Any, FloatArray] = {}

@@ -304,12 +304,12 @@ class Conditions:
         )
 
 
-def design_of(source: str, *given: Any) -> Callable[[dict[str, FloatArray], str], ObserverDesign]:
+def design_of(source: str, *arguments: Any) -> Callable[[dict[str, FloatArray], str], ObserverDesign]:
     """Return how gains of these conditions become a verified design: a function that `obsynth.methods` provides.
 
-    ``source`` names the conditions, and ``given`` is what their designs need beside the gains: the plant, first.
+    ``source`` names the conditions, and ``arguments`` is what their designs need beside the gains: the plant, first.
     """
-    return lambda gains, name: registered("design_of_conditions")(source, *given, gains, name)
+    return lambda gains, name: registered("design_of_conditions")(source, *arguments, gains, name)
 
 
 class Letters(dict[str, Any]):

@@ -102,8 +102,8 @@ def rated_inequalities(
     _require_fitting(errors, rate, level, decay, gains)
     n, m = errors.order, errors.outputs
     P = [cp.Variable((n, n), symmetric=True, name=f"P[{k + 1}]") for k in range(degree + 1)]
-    given_gains = None if gains is None else [np.asarray(L, np.float64) for L in gains]
-    Y = [cp.Variable((n, m), name=f"Y[{k + 1}]") for k in range(degree + 1)] if given_gains is None else []
+    fixed_gains = None if gains is None else [np.asarray(L, np.float64) for L in gains]
+    Y = [cp.Variable((n, m), name=f"Y[{k + 1}]") for k in range(degree + 1)] if fixed_gains is None else []
     room = cp.Variable(name="room") if goal == "decay" or level is not None else None
     slack: Any = margin if room is None else room
     squared = cp.Variable(nonneg=True, name="gamma_squared") if room is None else None
@@ -111,7 +111,7 @@ def rated_inequalities(
     for place, weights in coefficients_on_pieces(degree, pieces):
         constraints[f"P, {place}"] = lmi.at_least(_sum(P, weights), slack)
     gamma_squared = squared if level is None else level**2
-    matrices = _coefficients_v6(errors, (P, Y), gamma_squared, given_gains, rate, decay, goal, pieces)
+    matrices = _coefficients_v6(errors, (P, Y), gamma_squared, fixed_gains, rate, decay, goal, pieces)
     constraints |= {name: lmi.at_least(lmi.symmetric_blocks(lower), slack) for name, lower in matrices}
     variables = {each.name(): each for each in (*P, *Y)}
     if room is not None:
@@ -126,7 +126,7 @@ def rated_inequalities(
 
     def own_gains(_: Values) -> dict[str, FloatArray]:
         values = {each.name(): 0.5 * (each.value + each.value.T) for each in P}
-        ends = given_gains or [np.linalg.solve(values[P[k].name()], Y[k].value) for k in (0, degree)]
+        ends = fixed_gains or [np.linalg.solve(values[P[k].name()], Y[k].value) for k in (0, degree)]
         return values | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(ends)}
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:

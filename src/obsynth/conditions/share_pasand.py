@@ -30,9 +30,9 @@ from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.augmented_plant import (
     Decoupled,
-    combinations_seen,
     decouple,
     direct_part,
+    measured_combinations,
     paper_decoupling,
     realise,
     with_faults,
@@ -55,7 +55,7 @@ from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
-LEFT_TO_THE_UI_PI_INEQUALITY = ("(D2)", "(D3)", "fixed modes", "order of the fault model", "fault model in double")
+DECIDED_BY_THE_UI_PI_INEQUALITY = ("(D2)", "(D3)", "fixed modes", "order of the fault model", "fault model in double")
 
 #: Real numbers among which the slowest of a region is looked for: a scale alone depends on it.
 _REAL_RATES, _REAL_NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
@@ -134,7 +134,7 @@ def sharepasand(
     own = linear_plant(plant).dense()
     model = exosystem(fault_model, own.fault_names, own.dt)
     result = existence(own, model)
-    require_data(result.conditions, solvers=LEFT_TO_THE_UI_PI_INEQUALITY)
+    require_data(result.conditions, solvers=DECIDED_BY_THE_UI_PI_INEQUALITY)
     parts = _decoupling(result.plant, E_sharp, C_sharp, G)  # (10), (11)
     target = plant if result.transformation is None else result.transformation
     return augmented_problem(
@@ -176,7 +176,7 @@ def augmented_problem(
     def gains(values: Values) -> dict[str, FloatArray]:
         free = inequality.gain(values)
         K_a = free @ undisturbed + U_a @ injected
-        letters = realise(plant, model, (U_a, D_a, K_a), combinations_seen(plant))[1]
+        letters = realise(plant, model, (U_a, D_a, K_a), measured_combinations(plant))[1]
         nx = plant.nx
         return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
 

@@ -149,7 +149,12 @@ def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> T
     plant : PolytopicSystem
         Two vertices.
     gains : mapping
-        With ``T``, ``K[1]`` and ``K[2]``.
+        ``T (nx, nx)``, and ``K[1]`` and ``K[2]`` ``(nx, ny)``.
+
+    Returns
+    -------
+    TurningErrors
+        The error system, and how much of the faults its correction leaves in the errors.
 
     Raises
     ------

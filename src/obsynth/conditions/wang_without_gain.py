@@ -74,7 +74,7 @@ def wang_without_gain(
     squared = cp.Variable(nonneg=True) if level is None else level / unit**2
     Vw = variables.get("Vw")
     own_weight = None if Vw is None else cp.Variable(Vw.shape)
-    shown = fixed if own_weight is None else fixed + own_weight @ H
+    outputs = fixed if own_weight is None else fixed + own_weight @ H
     # Inputs that no estimate shows at once stand alone in M, where they say that the level is positive.
     counted = n + nd if convex.Zd.any() or convex.D.any() else n
     bases = {True: N, False: np.eye(n + nd)[:, :counted]}
@@ -88,7 +88,7 @@ def wang_without_gain(
         if own_weight is None or moves:
             inequalities.append(lmi.at_most(matrix + (fixed @ basis).T @ (fixed @ basis), -MARGIN))
         else:
-            inequalities.append(lmi.at_most(lmi.symmetric_blocks([[matrix], [shown @ basis, -np.eye(q)]]), -MARGIN))
+            inequalities.append(lmi.at_most(lmi.symmetric_blocks([[matrix], [outputs @ basis, -np.eye(q)]]), -MARGIN))
 
     def set_values() -> None:
         value, gamma_squared = P.value, float(squared.value)

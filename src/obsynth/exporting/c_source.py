@@ -55,12 +55,10 @@ _KEYWORDS = frozenset(
     }
 )
 
-
 #: What stands around declarations so that C++ calls functions by their names in C.
 _OPENED = '\n\n#ifdef __cplusplus\nextern "C" {\n#endif\n'
 
 _CLOSED = "#ifdef __cplusplus\n}\n#endif\n\n"
-
 
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024
@@ -75,7 +73,6 @@ ADVICE = (
     "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
     "are independent, and sums keep their order."
 )
-
 
 #: What a row is called in C, as runs call it.
 ROW_STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")

@@ -251,7 +251,7 @@ def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) ->
         "Az": structure.Az,
         "reading": structure.reading,
         "drive": bound.drive.reshape(-1, nv),
-        "shown": bound.shown,
+        "shown": bound.output_rows,
         "offsets": structure.offsets[None],
         "channels": structure.channel_rows,
         "kernels": bound.kernels,

@@ -24,7 +24,6 @@ from obsynth.simulation.dae import simulate_dae
 #: A number of a table, or of a line that a macro names.
 _WRITTEN_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
 
-
 #: Newton in floats: a last step whose square is rounding, and a residual of some roundings of its terms.
 FLOAT_LAST_STEP, FLOAT_RESIDUAL = 3e-4, 1e-5
 

@@ -48,7 +48,6 @@ EXPORTED = {
     ".json": FileKind("a proof file", rb'\A\{"format":"obsynth-proof"'),
 }
 
-
 #: Headers of C11, without their suffix.
 _C_HEADERS = re.compile(
     "assert|complex|ctype|errno|fenv|float|inttypes|iso646|limits|locale|math|setjmp|signal|stdalign|stdarg|stdatomic|"

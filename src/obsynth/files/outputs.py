@@ -25,7 +25,6 @@ PART = ".part"
 #: Bytes of the beginning and of the end of a file that are looked at to tell its kind.
 LOOKED_AT = 1 << 16
 
-
 #: Suffixes by which files of one format are named, the usual one first.
 SUFFIXES = (
     (".csv", ".tsv", ".txt"),

@@ -31,7 +31,6 @@ DECOUPLED = 1e-3
 #: Samples of a plant's settling time on a clock of its own.
 SETTLING_SAMPLES = 200
 
-
 #: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones,
 #: unless its noise times the root of its delay is so many times less.
 SLOW_ESTIMATE, SLOW_GAIN = 0.25, 10.0
@@ -39,17 +38,14 @@ SLOW_ESTIMATE, SLOW_GAIN = 0.25, 10.0
 #: Deviations of an estimate that a fault of a scenario must be at least, so that noise does not hide it.
 SEEN_DEVIATIONS = 2.0
 
-
 #: The condition that a refusal names, and what stands between it and what was found.
 _REFUSED_CONDITION = re.compile(r"(the condition '[^']+' fails) .*? Found: ")
 
 #: Letters of a message to which further sentences are shown.
 MOST_LETTERS = 160
 
-
 #: How many settling times figures look ahead.
 SETTLING_TIMES, MOST_FIGURE_SAMPLES = 8, 2000
-
 
 Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
 

@@ -37,14 +37,13 @@ _OF_THE_WHOLE_STATE = ("pd-observer", "ui-pi-observer")
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
 
-
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
 LARGEST_ROUNDED_SHARE = 0.1
 
-#: Share of a unit fault from which on rounding of the observer's own numbers is told.
+#: Share of a unit fault from which on rounding of the observer's own numbers is reported.
 TOLD_ROUNDING = 1e-6
 
-#: Share of a constant fault from which on rounding while the observer runs is told: what its estimate may miss.
+#: Share of a constant fault from which on rounding while the observer runs is reported: what its estimate may miss.
 TOLD_STEADY_ROUNDING = STEADY_ERROR
 
 #: Observers of more states are not examined under constant faults: one inverse of this size takes 20 ms.
@@ -92,7 +91,7 @@ def with_advice(
     from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 
     def holds(plant: DescriptorSystem) -> bool:
-        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
+        # What would help is a suggestion, not proved: the tried plant is decided exactly then.
         try:
             return all(condition.holds for condition in method.for_plant(plant).existence(plant, exactly=False))
         except (ObsynthError, np.linalg.LinAlgError):

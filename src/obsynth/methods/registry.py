@@ -30,7 +30,6 @@ _PLANT_KINDS: Mapping[PlantKind, tuple[type, str]] = {
     "polytopic": (PolytopicSystem, "a polytopic plant (PolytopicSystem)"),
 }
 
-
 __all__ = [
     "AUTO",
     "REGISTRY",

@@ -36,7 +36,6 @@ Given = ParamSpec("Given")
 
 Made = TypeVar("Made")
 
-
 #: More entries of matrices are not taken: of one in a file (of a sparse one, those that are stored), and along a
 #: horizon of all that change.
 MAXIMUM_ENTRIES = 50_000_000
@@ -50,10 +49,10 @@ def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concat
     usual = {name: option.default for name, option in signature(make).parameters.items() if option.kind == KEYWORD}
 
     @wraps(make)
-    def once(item: Any, /, *given: Given.args, **named: Given.kwargs) -> Made:
-        cache, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
+    def once(item: Any, /, *arguments: Given.args, **named: Given.kwargs) -> Made:
+        cache, key = known.setdefault(item, {}), (arguments, frozenset((usual | named).items()))
         if key not in cache:
-            cache[key] = make(item, *given, **named)
+            cache[key] = make(item, *arguments, **named)
         return cache[key]
 
     return once

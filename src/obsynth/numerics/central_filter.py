@@ -71,7 +71,7 @@ DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
 #: The same share where states are many: no gain that is shipped is smaller than ten times that.
 COARSELY_DECOUPLED = 1e-4
 
-#: Points so far out that a combination which waits for samples, or takes the last ones alone, is told by its growth.
+#: Points so far out that a combination which waits for samples, or takes only the last ones, shows by its growth.
 FAR_POINTS, MOST_FAR_GROWTH, LEAST_FAR_DECAY = (1e2, 1e3), 3.0, 0.3
 
 SAME_ROWS = 1e-8
@@ -79,9 +79,7 @@ SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
-
 Found = TypeVar("Found")
-
 
 #: A gain this close to one that no filter is below is the least.
 AT_THE_BOUND = 1e-6

@@ -126,7 +126,7 @@ def estimation_problem(
     bh, dh = (np.hstack([bf, bd]), np.hstack([df, dd])) if exact else (bd, dd)
     if not exact:
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
-    # Of what no output shows nothing is told, and nothing need be told.
+    # Of what no output shows nothing is told, and nothing need be reported.
     visible = seen_part(form.A, bh, form.C, dh)
     wanted, reference = (
         _told_from_outputs(visible.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)

@@ -45,7 +45,6 @@ BLOCK_ROWS = 4
 #: Directions in which that is measured, beside those that make the basis.
 PROBES = 6
 
-
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
 

@@ -16,7 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 #: factorisation is faster, and C compilers take ten times as long.
 SMALL = 8
 
-#: A pivot below this ends the factorisation, and the function with it; the caller is told and has no result.
+#: A pivot below this ends the factorisation, and the function with it; the caller learns it and has no result.
 SINGULAR = 1e-16
 
 

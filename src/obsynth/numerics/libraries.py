@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 #: How scipy says, by a ValueError, that an overflow has reached LAPACK, or that LAPACK cannot reorder a Schur form.
 _NUMERICAL_VALUE_ERRORS = ("infs or NaNs", "too far from generalized Schur form")
 
-
 #: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
 #: twelve times as much at 100 states (``benchmarks/README.md``).
 STATES_WORTH_THREADS = 1000

@@ -27,7 +27,6 @@ SAFE_E_CONDITION = 1e5
 #: An eigenvalue belongs to the closest of others unless a second one is not further away than this many times that.
 TIE = 4.0
 
-
 #: Square E and A of a tall pencil in an orthonormal basis of the range of E, and what is beside it.
 _SquarePart: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 

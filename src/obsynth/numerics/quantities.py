@@ -96,20 +96,20 @@ def in_seconds(value: Any, name: str) -> Any:
     return value.total_seconds() if isinstance(value, timedelta) else in_unit(value, "s", name)
 
 
-def numbers_in_units(given: Any, units: Mapping[str, str], name: str, *, are_differences: bool = False) -> Any:
+def numbers_in_units(values: Any, units: Mapping[str, str], name: str, *, are_differences: bool = False) -> Any:
     """Return a mapping from signals, or from signals to mappings of numbers, with each quantity as a number in the unit
     that is stated of its signal; anything else as it is."""
 
     def number(value: Any, signal: str, place: str) -> Any:
         return in_unit(value, units.get(signal), place, is_difference=are_differences)
 
-    if not isinstance(given, Mapping):
-        return given
+    if not isinstance(values, Mapping):
+        return values
     return {
         signal: {key: number(item, signal, f"{name}[{signal!r}].{key}") for key, item in value.items()}
         if isinstance(value, Mapping)
         else number(value, signal, f"{name}[{signal!r}]")
-        for signal, value in given.items()
+        for signal, value in values.items()
     }
 
 

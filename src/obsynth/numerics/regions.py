@@ -21,6 +21,7 @@ from obsynth.numerics.arrays import FloatArray, freeze
 @dataclass(frozen=True, eq=False)
 class LMIRegion:
     """A region of the complex plane: all z with ``L + z M + conj(z) M' < 0``; open, convex, symmetric to the real axis.
+    `disk`, `half_plane` and `sector` make regions, and ``&`` their intersections.
 
     Parameters
     ----------
@@ -32,6 +33,17 @@ class LMIRegion:
         The region in words.
     parts : tuple of dict
         The same as plain data: ``{"disk": [center, radius]}``, ``{"half_plane": decay}``, ``{"sector": damping}``.
+
+    Raises
+    ------
+    TypeError
+        ``&`` is used with anything but another region.
+
+    Examples
+    --------
+    >>> from obsynth.conditions import disk, half_plane
+    >>> disk(0.0, 2.0) & half_plane(0.5)
+    disk(0, 2) & half_plane(0.5)
     """
 
     L: FloatArray

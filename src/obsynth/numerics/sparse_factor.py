@@ -33,7 +33,6 @@ PERTURBATION = 1e-14
 #: Samples of the usual size of terms, and how far their mean may be off.
 SIZE_SAMPLES, MEAN_FACTOR = 8, 8.0
 
-
 #: Splits a double into halves whose products are exact.
 SPLITTER = 2.0**27 + 1.0
 

@@ -122,7 +122,7 @@ def robust_advance(
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
-        # Beside a missing input nearer samples wait for the next one as well: no fault is told of in this row.
+        # Beside a missing input nearer samples wait for the next one as well: no fault is reported in this row.
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
         mean, usual, reach, far, apart = _judged(limit, least, predicted, state, y, u_taken)
         if wary is not None:

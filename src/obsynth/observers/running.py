@@ -20,7 +20,6 @@ from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 #: The residual of an observer of a nonlinear plant: of its equations in each step.
 STEP_RESIDUAL = ("equations",)
 
-
 State = TypeVar("State")
 
 Row = TypeVar("Row")

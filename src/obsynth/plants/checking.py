@@ -81,14 +81,14 @@ def picked_names(value: Any) -> tuple[str, ...] | None:
     return tuple(value) if is_name_list(value) else None
 
 
-def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
+def signal_counts(matrices_by_name: Mapping[str, FloatArray | None]) -> dict[str, int]:
     """Return the number of signals of each kind, from the first matrix that tells."""
 
     def columns(*names: str) -> int:
-        matrices = (given.get(name) for name in names)
+        matrices = (matrices_by_name.get(name) for name in names)
         return next((m.shape[1] for m in matrices if m is not None and 0 not in m.shape), 0)
 
-    outputs = given.get("C")
+    outputs = matrices_by_name.get("C")
     counts = {signal: columns(*names) for signal, names in COUNTED_BY.items()}
     return counts | {"y": 0 if outputs is None else outputs.shape[0]}
 
@@ -125,11 +125,11 @@ def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str,
     return dict(units or {})
 
 
-def _values(given: Mapping[str, float] | None, known: set[str], what: str, kind: str) -> dict[str, float]:
+def _values(values: Mapping[str, float] | None, known: set[str], what: str, kind: str) -> dict[str, float]:
     """Return numbers of signals, which all exist; a scale is not zero."""
-    require_mapping(given, what)
-    require_known(given or {}, known, what=what, kind=kind)
-    checked = {name: float(as_matrix(value, f"{what}[{name!r}]")[0, 0]) for name, value in (given or {}).items()}
+    require_mapping(values, what)
+    require_known(values or {}, known, what=what, kind=kind)
+    checked = {name: float(as_matrix(value, f"{what}[{name!r}]")[0, 0]) for name, value in (values or {}).items()}
     for name, value in checked.items():
         require_no_overflow(value, f"{what}[{name!r}]", what)
         if what == "scales" and value == 0.0:

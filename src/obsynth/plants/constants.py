@@ -296,38 +296,38 @@ def tolerance_share(value: Any, path: str) -> float:
     return float(value)
 
 
-def constant_of(name: str, given: Any, *, nominal: float | None = None) -> Constant:
+def constant_of(name: str, entry: Any, *, nominal: float | None = None) -> Constant:
     """Return a constant from a number, ``(low, high)`` or a mapping with `nominal`, `tolerance` or `range`, `unit`."""
     path = f"constants.{name}"
-    if isinstance(given, Constant):
-        return Constant(name, given.nominal, given.low, given.high, given.unit)
-    if is_number(given) and nominal is None:
-        return Constant(name, float(given), float(given), float(given))
-    if isinstance(given, str) and nominal is None:
+    if isinstance(entry, Constant):
+        return Constant(name, entry.nominal, entry.low, entry.high, entry.unit)
+    if is_number(entry) and nominal is None:
+        return Constant(name, float(entry), float(entry), float(entry))
+    if isinstance(entry, str) and nominal is None:
         raise SpecError(
-            f"{name!r} is the text {given!r}, which is no number: give a number, or nominal, tolerance and unit by "
+            f"{name!r} is the text {entry!r}, which is no number: give a number, or nominal, tolerance and unit by "
             "these keys.",
             path=path,
         )
-    if isinstance(given, str) or is_number(given):
-        given = {"tolerance": given}
-    if isinstance(given, (tuple, list)):
-        given = {"range": given}
-    if not isinstance(given, Mapping):
-        raise SpecError(f"{name!r} is {given!r}: give nominal and tolerance, or a range.", path=path)
-    for key in given:
+    if isinstance(entry, str) or is_number(entry):
+        entry = {"tolerance": entry}
+    if isinstance(entry, (tuple, list)):
+        entry = {"range": entry}
+    if not isinstance(entry, Mapping):
+        raise SpecError(f"{name!r} is {entry!r}: give nominal and tolerance, or a range.", path=path)
+    for key in entry:
         if key not in _KEYS:
             raise SpecError(f"{key!r} is unknown: a constant has {', '.join(_KEYS)}.", path=f"{path}.{key}")
-    unit = given.get("unit") or ""
+    unit = entry.get("unit") or ""
     if not isinstance(unit, str):
         raise SpecError(f"The unit of {name!r} is {unit!r}, no text.", path=f"{path}.unit")
-    return _with_range(name, given, given.get("nominal") if given.get("nominal") is not None else nominal, unit)
+    return _with_range(name, entry, entry.get("nominal") if entry.get("nominal") is not None else nominal, unit)
 
 
-def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> Constant:
-    path, ends = f"constants.{name}", given.get("range")
+def _with_range(name: str, entry: Mapping[str, Any], middle: Any, unit: str) -> Constant:
+    path, ends = f"constants.{name}", entry.get("range")
     if ends is not None:
-        if given.get("tolerance") is not None:
+        if entry.get("tolerance") is not None:
             raise SpecError(f"{name!r} has both a tolerance and a range: give one of them.", path=path)
         two = not isinstance(ends, str) and hasattr(ends, "__len__") and len(ends) == 2
         if not (two and all(map(is_finite_number, ends)) and ends[0] <= ends[1]):
@@ -342,7 +342,7 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
     if not is_finite_number(middle):
         raise SpecError(f"{name!r} has no nominal value: give a number, or a range.", path=path)
     center = float(middle)
-    share = tolerance_share(given.get("tolerance", 0.0), f"{path}.tolerance")
+    share = tolerance_share(entry.get("tolerance", 0.0), f"{path}.tolerance")
     if share and center == 0.0:
         raise SpecError(
             f"The nominal value of {name!r} is zero, which has no per cent: give a range.", path=f"{path}.tolerance"
@@ -352,7 +352,7 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
 
 
 def constants_box(
-    given: Mapping[str, Any] | ConstantsBox,
+    entries: Mapping[str, Any] | ConstantsBox,
     *,
     known: Mapping[str, Constant] | None = None,
     variation: str | None = None,
@@ -363,13 +363,13 @@ def constants_box(
     calibration: str | None = None,
 ) -> ConstantsBox:
     """Return a box from a mapping by name; nominal values that are left out are those of ``known``."""
-    if isinstance(given, ConstantsBox):
-        return given
-    if not isinstance(given, Mapping):
-        raise SpecError(f"constants is {given!r}: give a mapping from names to tolerances.", path="constants")
+    if isinstance(entries, ConstantsBox):
+        return entries
+    if not isinstance(entries, Mapping):
+        raise SpecError(f"constants is {entries!r}: give a mapping from names to tolerances.", path="constants")
     before = known or {}
     constants = dict(before)
-    for name, value in given.items():
+    for name, value in entries.items():
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
         constants[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)

@@ -28,7 +28,6 @@ BUTCHER: dict[str, FloatArray] = {
     ),
 }
 
-
 #: Samples in one call.  After a sample that had to be taken by itself the shorter stretch is tried first: hard samples
 #: come together, and what follows one inside a stretch is lost.
 STRETCHES = (16, 256)

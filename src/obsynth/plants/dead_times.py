@@ -30,11 +30,11 @@ _TEXT = re.compile(r"\s*([-+0-9.eE]+)\s*([a-z]+)?\s*")
 WHOLE_SAMPLES = 1e-9
 
 
-def checked_delays(given: Any, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, float]:
+def checked_delays(entries: Any, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, float]:
     """Return dead times in seconds by input or output, without those that are zero."""
-    require_mapping(given, "delays")
+    require_mapping(entries, "delays")
     delays, both = {}, set(inputs) & set(outputs)
-    for name, value in (given or {}).items():
+    for name, value in (entries or {}).items():
         if name in both:
             raise SpecError(
                 f"delays names {name!r}, which is an input and an output: give them different names.", path="delays"

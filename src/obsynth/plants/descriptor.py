@@ -172,7 +172,7 @@ class DescriptorSystem:
     ) -> None:
         if A is None:
             raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
-        asked = {"E": E, "A": A, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
+        matrices = {"E": E, "A": A, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
         names = {
             "state_names": state_names,
             "input_names": input_names,
@@ -185,7 +185,7 @@ class DescriptorSystem:
         point = numbers_in_units(operating_point, stated, "operating_point")
         noise = numbers_in_units(sensor_noise, stated, "sensor_noise", are_differences=True)
         values = plant_fields(
-            asked,
+            matrices,
             names,
             dt=dt,
             operating_point=point,

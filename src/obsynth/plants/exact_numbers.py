@@ -43,10 +43,10 @@ class ExactNumbers:
         """Return the numbers before any were taken for rounding."""
         return self if self.uncleaned is None else replace(self, matrices=self.uncleaned, uncleaned=None)
 
-    def require_of(self, given: Mapping[str, FloatArray]) -> None:
+    def require_of(self, matrices: Mapping[str, FloatArray]) -> None:
         """Raise `SpecError` where these are not the numbers behind the matrices of a plant, by name."""
         for name in DECISIVE:
-            rows, matrix = self.matrices[name], given[name]
+            rows, matrix = self.matrices[name], matrices[name]
             if (len(rows), *{len(row) for row in rows}) not in (matrix.shape, matrix.shape[:1]):
                 raise SpecError(f"exact has another size of {name} than the plant: leave it out.", path="exact")
             rounded = [value.numerator / value.denominator for row in rows for value in row]

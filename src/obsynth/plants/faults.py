@@ -27,7 +27,6 @@ MULTIPLE_EIGENVALUE = 1e-4
 #: The same for built-in models, whose matrices are triangular or diagonalisable: only rounding separates copies.
 SAME_EIGENVALUE = 1e-9
 
-
 #: Words for polynomials, and their orders.
 POLYNOMIAL_WORDS = {"step": 0, "ramp": 1, "parabola": 2}
 
@@ -82,18 +81,30 @@ def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class FaultModel:
-    """The exosystem of one fault.
+    """The model ``xi' = Phi xi, f = Cw xi`` of one fault f; `obsynth.fault_model` makes those with names.
 
     Parameters
     ----------
     Phi : FloatArray
-        ``(n, n)``; in continuous time (per second) unless ``sampled``.
+        ``(n, n)``, in continuous time (1/s), or with ``sampled`` the transition over one sample of the plant.
     Cw : FloatArray
         ``(1, n)``.
     description : str
         In words.
     sampled : bool
-        Whether ``Phi`` is the transition over one sample of the plant, as given by the user.
+        Whether ``Phi`` is the transition over one sample.
+
+    Raises
+    ------
+    SpecError
+        ``Phi`` or ``Cw`` is no matrix of finite numbers.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> ramp = obsynth.FaultModel(Phi=[[0, 1], [0, 0]], Cw=[[1, 0]], description="ramp")
+    >>> ramp.order, ramp.transition(0.5).tolist()
+    (2, [[1.0, 0.5], [0.0, 1.0]])
     """
 
     Phi: FloatArray
@@ -228,10 +239,10 @@ def fault_model(data: Any) -> FaultModel:
 
 def _observable(model: FaultModel) -> FaultModel:
     balanced, states = balanced_transition(model.Phi)
-    shown = model.Cw * states
-    size = largest_singular_value(balanced) / (float(np.linalg.norm(shown)) or 1.0)
+    output = model.Cw * states
+    size = largest_singular_value(balanced) / (float(np.linalg.norm(output)) or 1.0)
     for value in model.eigenvalues(0.0):
-        tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
+        tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * output.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:
             raise _refused(
                 f"Some state of the fault model ({model.description}) is unobservable in the fault, at the "

@@ -41,7 +41,6 @@ MATRIX_LAYOUT = (
     ("Dw", "y", "w"),
 )
 
-
 #: Names of the signals of each kind.
 _FIELDS = {
     "x": "state_names",
@@ -52,14 +51,11 @@ _FIELDS = {
     "w": "noise_names",
 }
 
-
 # Where a matrix picked by names names the signal as well.
 _NAMED_BY = {"output_names": "C", "fault_names": "Bf", "disturbance_names": "Bd"}
 
-
 #: Matrices of outputs that may be given by the names of sensors, each with that of the dynamics beside it.
 SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
-
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
 
@@ -109,7 +105,7 @@ def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what:
 
 
 def plant_fields(
-    asked: Mapping[str, Any],
+    stated_matrices: Mapping[str, Any],
     names: Mapping[str, Sequence[str] | None],
     *,
     dt: Any,
@@ -121,7 +117,7 @@ def plant_fields(
 ) -> dict[str, Any]:
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
     problems = Problems()
-    matrices, labels = _without_frames(asked, names)
+    matrices, labels = _without_frames(stated_matrices, names)
     a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
@@ -192,52 +188,52 @@ def _identity_like(a: Any) -> Any:
 def _appended(
     matrices: Mapping[str, Any],
     labels: Mapping[str, Sequence[str] | None],
-    given: dict[str, FloatArray | None],
+    fields: dict[str, FloatArray | None],
     sensor_noise: Any,
     problems: Problems,
 ) -> dict[str, tuple[str, ...]]:
-    """Append what is given by the names of sensors to ``given``; return the names of these signals by field."""
+    """Append what is given by the names of sensors to ``fields``; return the names of these signals by field."""
     if sensor_noise is None and not any(is_name_list(matrices[name]) for name in SENSOR_PICKS):
         return {}
-    if matrices["C"] is not None and given.get("C") is None:
+    if matrices["C"] is not None and fields.get("C") is None:
         return {}
     names = labels["output_names"]
     stated = picked_names(matrices["C"]) if names is None else names
     outputs = problems.collect(
-        lambda: checked_names(stated, signal_counts(given)["y"], prefix="y", what="output_names")
+        lambda: checked_names(stated, signal_counts(fields)["y"], prefix="y", what="output_names")
     )
     problems.raise_if_any()
-    picked = problems.collect(lambda: _with_sensor_picks(matrices, given, outputs)) or {}
-    noises = problems.collect(lambda: _noise_of_sensors(sensor_noise, given, outputs)) or ()
+    picked = problems.collect(lambda: _with_sensor_picks(matrices, fields, outputs)) or {}
+    noises = problems.collect(lambda: _noise_of_sensors(sensor_noise, fields, outputs)) or ()
     return {"fault_names": picked.get("Df", ()), "disturbance_names": picked.get("Dd", ()), "noise_names": noises}
 
 
-def _size(given: Mapping[str, Any]) -> int:
-    return int(given["A"].shape[0])
+def _size(fields: Mapping[str, Any]) -> int:
+    return int(fields["A"].shape[0])
 
 
 def _with_sensor_picks(
-    asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
+    stated: Mapping[str, Any], fields: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Append a column to Df, Bf (Dd, Bd) in ``given`` for each sensor that Df (Dd) names; return these."""
+    """Append a column to Df, Bf (Dd, Bd) in ``fields`` for each sensor that Df (Dd) names; return these."""
     picks = {}
     for name, beside in SENSOR_PICKS.items():
-        picked = asked[name]
+        picked = stated[name]
         if not is_name_list(picked):
             continue
         columns = rows_picking(picked, outputs, what=name).T
-        own = given.get(beside)
-        dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
-        given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
-        given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
+        own = fields.get(beside)
+        dynamics = np.zeros((_size(fields), 0)) if own is None else dense(own)
+        fields[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
+        fields[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
         picks[name] = tuple(picked)
     return picks
 
 
 def _noise_of_sensors(
-    sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]
+    sensor_noise: Any, fields: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> tuple[str, ...]:
-    """Append a column to Bw, Dw in ``given`` for each sensor with a standard deviation; return their names."""
+    """Append a column to Bw, Dw in ``fields`` for each sensor with a standard deviation; return their names."""
     if sensor_noise is None:
         return ()
     require_kind(sensor_noise, Mapping, "sensor_noise", "a standard deviation by output, such as {'speed': 0.01}")
@@ -250,13 +246,13 @@ def _noise_of_sensors(
                 f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.", path="sensor_noise"
             )
         columns[list(outputs).index(name), column] = deviation
-    others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
-    nw, nx = others[0].shape[1] if others else 0, _size(given)
+    others = [matrix for name in ("Bw", "Dw") if (matrix := fields.get(name)) is not None and 0 not in matrix.shape]
+    nw, nx = others[0].shape[1] if others else 0, _size(fields)
     for name, rows, more in (("Bw", nx, np.zeros((nx, len(sensor_noise)))), ("Dw", len(outputs), columns)):
-        matrix = given.get(name)
+        matrix = fields.get(name)
         matrix = np.zeros((rows, nw)) if matrix is None or 0 in matrix.shape else dense(matrix)
         if matrix.shape != (rows, nw):
             # Its own message is enough.
             return ()
-        given[name] = np.hstack([matrix, more])
+        fields[name] = np.hstack([matrix, more])
     return tuple(f"noise {name}" for name in sensor_noise)

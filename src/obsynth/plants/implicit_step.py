@@ -25,7 +25,6 @@ from obsynth.plants.dae_functions import Compiled, DAEFunctions
 #: three or four are the rule.
 BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 
-
 #: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
 FIRST_FRACTION = 0.125
 
@@ -33,7 +32,6 @@ FIRST_FRACTION = 0.125
 LEAST_FRACTION = 2.0**-20
 
 MOST_SUBSOLVES = 10_000
-
 
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6

@@ -1,4 +1,4 @@
-"""What a plant says of its noise beyond white noise: words, and names of the states that stand for it."""
+"""Sensor noise as a plant states it: white, coloured and offsets; its variance per sample, names of its states."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from obsynth.plants.signal_names import index_of
 #: Stands for a number that `obsynth.calibrate` is to find.
 UNKNOWN_NUMBER = "unknown"
 
-
 #: White noise beside coloured noise whose size is not stated, as a share of its deviation: no sensor is without any.
 DEFAULT_WHITE_SHARE = 0.01
 
@@ -38,12 +37,12 @@ def assumed_noise_names(outputs: Sequence[str]) -> list[str]:
 
 
 def is_noise_assumed(noise_names: Sequence[str]) -> bool:
-    """Whether the noise of a plant is what a method assumes, and not what somebody stated."""
+    """Whether the noise of a plant is assumed by a method, and not stated."""
     return bool(noise_names) and all(name.startswith(f"{ASSUMED} ") for name in noise_names)
 
 
 def noise_words(noise_names: Sequence[str]) -> str:
-    """Return what to call the noise of a plant: stated, or assumed."""
+    """Return the words for the noise of a plant: stated, or assumed."""
     return f"the {ASSUMED} (none is stated)" if is_noise_assumed(noise_names) else "the stated noise"
 
 
@@ -68,8 +67,8 @@ def offset_state(output: str) -> str:
     return re.sub(r"\W", "_", f"offset_{output}")
 
 
-def kept_share(correlation: float, dt: float, integration: str) -> float:
-    """Return what a sample keeps of coloured noise, as a method of integration steps it; exactly for others."""
+def successive_correlation(correlation: float, dt: float, integration: str) -> float:
+    """Return the correlation of successive samples of coloured noise, as an integration method makes it, or exactly."""
     if integration not in BUTCHER:
         return float(np.exp(-dt / correlation))
     stages = len(BUTCHER[integration])
@@ -80,20 +79,20 @@ def kept_share(correlation: float, dt: float, integration: str) -> float:
 
 def process_variance(variance: float, correlation: float, dt: float, integration: str) -> float:
     """Return the variance per step on the equation of coloured noise, so that the noise has the stated variance."""
-    share = kept_share(correlation, dt, integration)
+    share = successive_correlation(correlation, dt, integration)
     if integration not in BUTCHER:
         return variance * (1.0 - share**2)
     return variance * (1.0 + share) / (correlation**2 * (1.0 - share))
 
 
 def noise_variance(process: float, correlation: float, dt: float, integration: str) -> float:
-    """Return the variance of coloured noise whose equation has a variance per step: `process_variance` turned round."""
+    """Return the variance of coloured noise from that of its equation per step: the inverse of `process_variance`."""
     return process / process_variance(1.0, correlation, dt, integration)
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of one sensor: deviations of what is coloured and of what is white, and the correlation in s or zero."""
+    """Noise of one sensor: deviations of its coloured and white parts, correlation time in s (0: all white)."""
 
     deviation: float
     correlation: float
@@ -127,11 +126,11 @@ def stated_number(value: Any, path: str) -> float:
     return real_number(value, path, f"a number above 0 ({', '.join(SECONDS_IN_UNIT)} for times)", above=0.0)
 
 
-def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:
+def sensor_noises(entries: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:
     """Return the noise of each sensor of which something is stated."""
-    require_mapping(given, "sensor_noise")
+    require_mapping(entries, "sensor_noise")
     noises = {}
-    for name, item in (given or {}).items():
+    for name, item in (entries or {}).items():
         index_of(name, outputs, what="sensor_noise")
         path = f"sensor_noise.{name}"
         if not isinstance(item, Mapping):

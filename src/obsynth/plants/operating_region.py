@@ -67,7 +67,7 @@ class OperatingRegion:
     arguments: FloatArray
 
     @classmethod
-    def of(cls, terms: NonlinearTerms, given: Mapping[str, Any]) -> OperatingRegion:
+    def of(cls, terms: NonlinearTerms, region: Mapping[str, Any]) -> OperatingRegion:
         """Return the region of ranges by name or linear expression.
 
         Raises
@@ -77,12 +77,12 @@ class OperatingRegion:
         PreconditionError
             An argument of a nonlinearity has no finite range.
         """
-        if not isinstance(given, Mapping) or not given:
+        if not isinstance(region, Mapping) or not region:
             raise SpecError(
                 "region must name ranges, such as {'h2': [0.1, 0.6], 'h1 - h2': [0.02, 0.55]}.", path="region"
             )
         known = (*terms.names, *terms.input_names)
-        ranges = tuple(_range(str(text), ends, known) for text, ends in given.items())
+        ranges = tuple(_range(str(text), ends, known) for text, ends in region.items())
         arguments = np.array([_argument_range(each, ranges) for each in terms.arguments]).reshape(-1, 2)
         return cls(terms, ranges, arguments)
 

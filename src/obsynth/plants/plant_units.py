@@ -72,14 +72,14 @@ class PlantUnits:
         exponents = problem.solve()
         _fix_sizes(plant, exponents, (equations, outputs), (states, faults, disturbances))
         factors = np.exp2(exponents)
-        own, left = factors[states], factors[equations] * (1.0 if plant.is_discrete else factors[0])
-        shown = _inverse_sizes(plant.C * own, plant.Df, plant.Dd)
+        own, equation_units = factors[states], factors[equations] * (1.0 if plant.is_discrete else factors[0])
+        output_units = _inverse_sizes(plant.C * own, plant.Df, plant.Dd)
         entering = [
-            _inverse_sizes((left[:, None] * inner).T, (shown[:, None] * direct).T)
+            _inverse_sizes((equation_units[:, None] * inner).T, (output_units[:, None] * direct).T)
             for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
         ]
         courses = _model_units(model, factors[fault_model], entering[0])
-        units = (factors[equations], own, shown, *entering, courses)
+        units = (factors[equations], own, output_units, *entering, courses)
         parts = {kind: read_only(part) for kind, part in zip(_SIGNAL_KINDS, units, strict=True)}
         return cls(time=plant.dt or float(factors[0]), discrete=plant.is_discrete, **parts)
 
@@ -120,21 +120,21 @@ class PlantUnits:
 
     def scaled_plant(self, plant: DescriptorSystem) -> DescriptorSystem:
         """Return the plant in these units; known inputs keep theirs, and noise its unit intensity."""
-        left = self.rate * self.equations[:, None]
-        shown = self.outputs[:, None]
+        equations = self.rate * self.equations[:, None]
+        outputs = self.outputs[:, None]
         spread = 1.0 if self.discrete else float(np.sqrt(self.time))
         return plant.replace(
             E=self.equations[:, None] * plant.E * self.states,
-            A=left * plant.A * self.states,
-            B=left * plant.B,
-            Bf=left * plant.Bf * self.faults,
-            Bd=left * plant.Bd * self.disturbances,
+            A=equations * plant.A * self.states,
+            B=equations * plant.B,
+            Bf=equations * plant.Bf * self.faults,
+            Bd=equations * plant.Bd * self.disturbances,
             Bw=spread * self.equations[:, None] * plant.Bw,
-            C=shown * plant.C * self.states,
-            D=shown * plant.D,
-            Df=shown * plant.Df * self.faults,
-            Dd=shown * plant.Dd * self.disturbances,
-            Dw=shown * plant.Dw / spread,
+            C=outputs * plant.C * self.states,
+            D=outputs * plant.D,
+            Df=outputs * plant.Df * self.faults,
+            Dd=outputs * plant.Dd * self.disturbances,
+            Dw=outputs * plant.Dw / spread,
             dt=1.0 if self.discrete else 0.0,
         )
 

@@ -270,30 +270,30 @@ def _from_vertices(
         count = len(dense)
         names = tuple(f"weight{i + 1}" for i in range(count))
         return dense, Scheduling(names, np.zeros(count), np.ones(count), (None,) * count, ())
-    asked = parameters_of(scheduling)
-    if len(dense) != 2 or len(asked) != 1:
+    parameters = parameters_of(scheduling)
+    if len(dense) != 2 or len(parameters) != 1:
         raise SpecError(
             "scheduling beside vertices is one parameter of two vertices; the parameters of more are their weights "
             "(leave scheduling out), or give plant with expressions.",
             path="scheduling",
         )
-    return dense, _scheduling(asked, tuple(asked))
+    return dense, _scheduling(parameters, tuple(parameters))
 
 
-def _scheduling(asked: Mapping[str, Mapping[str, Any]], functions: Sequence[str]) -> Scheduling:
+def _scheduling(parameters: Mapping[str, Mapping[str, Any]], functions: Sequence[str]) -> Scheduling:
     return Scheduling(
-        tuple(asked),
-        np.array([entry["range"][0] for entry in asked.values()]),
-        np.array([entry["range"][1] for entry in asked.values()]),
-        tuple(entry.get("rate") for entry in asked.values()),
+        tuple(parameters),
+        np.array([entry["range"][0] for entry in parameters.values()]),
+        np.array([entry["range"][1] for entry in parameters.values()]),
+        tuple(entry.get("rate") for entry in parameters.values()),
         tuple(functions),
-        {name: str(entry["column"]) for name, entry in asked.items() if entry.get("column")},
-        {name: str(entry["unit"]) for name, entry in asked.items() if entry.get("unit")},
+        {name: str(entry["column"]) for name, entry in parameters.items() if entry.get("column")},
+        {name: str(entry["unit"]) for name, entry in parameters.items() if entry.get("unit")},
     )
 
 
-def _constants(given: Mapping[str, float] | None) -> dict[str, float]:
-    constants = dict(given or {})
+def _constants(values: Mapping[str, float] | None) -> dict[str, float]:
+    constants = dict(values or {})
     for name, value in constants.items():
         if not is_finite_number(value):
             raise SpecError(f"The constant {name!r} is {shown(value)}: give a finite number.", path=f"constants.{name}")
@@ -301,16 +301,18 @@ def _constants(given: Mapping[str, float] | None) -> dict[str, float]:
 
 
 def _from_expressions(
-    given: Mapping[str, Any], scheduling: Mapping[str, Any] | None, constants: Mapping[str, float]
+    plant_arguments: Mapping[str, Any], scheduling: Mapping[str, Any] | None, constants: Mapping[str, float]
 ) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
     """Return the vertices of a plant whose entries are expressions, and its scheduling."""
-    if not isinstance(given, Mapping):
-        raise SpecError(f"plant is {a_kind(given)}: give the arguments of DescriptorSystem by name.", path="plant")
-    asked = parameters_of(scheduling)
-    both = sorted(set(asked) & set(constants))
+    if not isinstance(plant_arguments, Mapping):
+        raise SpecError(
+            f"plant is {a_kind(plant_arguments)}: give the arguments of DescriptorSystem by name.", path="plant"
+        )
+    parameters = parameters_of(scheduling)
+    both = sorted(set(parameters) & set(constants))
     if both:
         raise SpecError(f"{both[0]!r} is both a scheduling parameter and a constant.", path=f"scheduling.{both[0]}")
-    arguments, forms = dict(given), dict[str, list[tuple[int, int, LinearForm]]]()
+    arguments, forms = dict(plant_arguments), dict[str, list[tuple[int, int, LinearForm]]]()
     if expressions_in(arguments.get("E"))[1]:
         raise PreconditionError(
             "E has an expression: with a matrix E(mu) beside the next state a proof at the vertices says nothing of "
@@ -321,21 +323,21 @@ def _from_expressions(
     for name in SCHEDULED_MATRICES:
         arguments[name], entries = expressions_in(arguments.get(name))
         forms[name] = [
-            (row, column, _form(text, f"{name}[{row + 1},{column + 1}]", constants, tuple(asked)))
+            (row, column, _form(text, f"{name}[{row + 1},{column + 1}]", constants, tuple(parameters)))
             for row, column, text in entries
         ]
-    functions = list(asked)
+    functions = list(parameters)
     for form in (form for entries in forms.values() for _, _, form in entries):
         functions += [text for text in form.parts if text not in functions]
     used = {text for entries in forms.values() for _, _, form in entries for text in form.parts}
     needed = {name for text in used for name in parse_expression(text).names}
-    idle = [name for name in asked if name not in needed]
+    idle = [name for name in parameters if name not in needed]
     if idle:
         raise SpecError(
             f"No entry depends on {idle[0]!r}: leave it out of scheduling, or write it into an entry of the matrices.",
             path=f"scheduling.{idle[0]}",
         )
-    held = _scheduling(asked, [text for text in functions if text in used])
+    held = _scheduling(parameters, [text for text in functions if text in used])
     base = _descriptor({key: value for key, value in arguments.items() if value is not None})
     return tuple(_vertex(base, forms, dict(zip(held.functions, row, strict=True))) for row in held.corners), held
 

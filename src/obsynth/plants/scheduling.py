@@ -163,16 +163,16 @@ class Scheduling:
         values = zip(self.functions, self.corners[place], strict=True)
         return f"vertex {place + 1} ({', '.join(f'{name} = {value:.6g}' for name, value in values)})"
 
-    def values(self, given: Mapping[str, float] | Sequence[float] | FloatArray) -> FloatArray:
+    def values(self, point: Mapping[str, float] | Sequence[float] | FloatArray) -> FloatArray:
         """Return the parameters in order; raise `SpecError` for a missing or an unknown one."""
-        if isinstance(given, Mapping):
-            if set(given) != set(self.names):
+        if isinstance(point, Mapping):
+            if set(point) != set(self.names):
                 raise SpecError(
-                    f"Scheduling parameters {', '.join(map(repr, given))} are given; give {', '.join(self.names)}.",
+                    f"Scheduling parameters {', '.join(map(repr, point))} are given; give {', '.join(self.names)}.",
                     path="scheduling",
                 )
-            given = [given[name] for name in self.names]
-        values = np.asarray(given, dtype=np.float64).ravel()
+            point = [point[name] for name in self.names]
+        values = np.asarray(point, dtype=np.float64).ravel()
         if values.shape != (len(self.names),):
             raise SpecError(f"Give {len(self.names)} scheduling parameters.", path="scheduling")
         return values
@@ -186,9 +186,9 @@ class Scheduling:
         """Return parameters ``(p,)`` moved into their ranges, one by one."""
         return np.minimum(np.maximum(values, self.low), self.high)
 
-    def weights(self, given: Mapping[str, float] | Sequence[float] | FloatArray) -> FloatArray:
+    def weights(self, point: Mapping[str, float] | Sequence[float] | FloatArray) -> FloatArray:
         """Return the weights ``(N,)`` of the vertices at parameters, which are moved into their ranges first."""
-        values = self.nearest(self.values(given))
+        values = self.nearest(self.values(point))
         if self.gives_weights:
             total = float(values.sum())
             return values / total if total > 0.0 else np.full(len(values), 1.0 / len(values))
@@ -289,12 +289,12 @@ def _require_rate(name: str, rate: Any) -> None:
         )
 
 
-def parameters_of(given: Any) -> dict[str, dict[str, Any]]:
+def parameters_of(scheduling: Any) -> dict[str, dict[str, Any]]:
     """Return scheduling parameters as ``{name: {range, rate, column, unit}}``; raise `SpecError` for anything else."""
-    if not isinstance(given, Mapping) or not given:
+    if not isinstance(scheduling, Mapping) or not scheduling:
         raise SpecError("scheduling must name one or more parameters, such as {v: {range: [1, 3]}}.", path="scheduling")
     checked = {}
-    for name, entry in given.items():
+    for name, entry in scheduling.items():
         path = f"scheduling.{name}"
         entry = entry if isinstance(entry, Mapping) else {"range": entry}
         unknown = sorted(set(map(str, entry)) - set(PARAMETER_KEYS))
@@ -357,8 +357,8 @@ def linear_form(expression: Expression, constants: Mapping[str, float], names: S
 
 
 def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
-    def done(*given: Any) -> LinearForm:
-        forms = [LinearForm.of(value) for value in given]
+    def done(*operands: Any) -> LinearForm:
+        forms = [LinearForm.of(value) for value in operands]
         if not any(form.parts for form in forms) and operation not in (np.add, np.subtract, np.multiply, np.divide):
             return LinearForm.of(operation(*(float(form.constant) for form in forms)))
         if operation is np.negative:

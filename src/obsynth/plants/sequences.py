@@ -22,7 +22,6 @@ INDEX_NAME = "k"
 #: Numbers of a computed sequence that are kept: two megabytes.
 MOST_KEPT_ENTRIES = 2**18
 
-
 #: Matrix, signal of its rows ("e" counts the equations), signal of its columns, first k at which it is needed.
 LAYOUT = (
     ("E", "e", "x", 1),

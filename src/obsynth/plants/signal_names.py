@@ -111,12 +111,12 @@ def _closest(name: str, known: Sequence[str]) -> list[str]:
     return [other for other, miss in zip(close, missed, strict=True) if miss <= MUCH_FARTHER * missed[0]]
 
 
-def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
+def require_known(names: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
     """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
     present = sorted(known)
     problems = [
         f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), present)}"
-        for name in given
+        for name in names
         if name not in present
     ]
     if len(problems) == 1 and problems[0].endswith("plant."):

@@ -128,11 +128,11 @@ class TimeVaryingDescriptorSystem:
         problems = Problems()
         known = problems.collect(lambda: checked_constants(constants))
         problems.raise_if_any()
-        asked = {"E": E, "A": A, "B": B, "C": C, "Phi": Phi, "Psi": Psi, "D": D}
+        matrices = {"E": E, "A": A, "B": B, "C": C, "Phi": Phi, "Psi": Psi, "D": D}
         sequences: dict[str, MatrixSequence | None] = {}
         for name, _, _, first in LAYOUT:
-            if asked[name] is not None:
-                make = partial(MatrixSequence.of, asked[name], name, first=first, constants=known)
+            if matrices[name] is not None:
+                make = partial(MatrixSequence.of, matrices[name], name, first=first, constants=known)
                 sequences[name] = problems.collect(make)
             elif name in ("A", "C"):
                 problems.note(f"{name} is missing: a plant needs A and C.", name)

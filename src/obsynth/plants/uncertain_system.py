@@ -26,12 +26,12 @@ from obsynth.plants.uncertainty import (
 )
 
 
-def stated_box(given: Any, variation: str | None = None) -> Any:
+def stated_box(constants: Any, variation: str | None = None) -> Any:
     """Return a calibrated box as a box of constants, with its level and digest; all else as it is."""
-    if not isinstance(given, CalibratedBox):
-        return given
+    if not isinstance(constants, CalibratedBox):
+        return constants
     return constants_box(
-        given.constants(), variation=variation, source="calibrated", level=given.level, digest=given.digest
+        constants.constants(), variation=variation, source="calibrated", level=constants.level, digest=constants.digest
     )
 
 
@@ -101,9 +101,9 @@ def uncertain_system(
     options = {"variation": variation, "source": source, "level": level, "digest": digest}
     before = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
     constants = stated_box(constants, variation or (None if before is None else before.box.variation))
-    for name, given in (("constants", constants), ("tolerance", tolerance)):
-        if not isinstance(given, ConstantsBox):
-            require_mapping(given, name)
+    for name, stated in (("constants", constants), ("tolerance", tolerance)):
+        if not isinstance(stated, ConstantsBox):
+            require_mapping(stated, name)
     if isinstance(plant, DescriptorSystem):
         system, entries = plant, dict[str, list[Entry]]()
         if before is not None:
@@ -236,7 +236,7 @@ def _boxed(
     boxed, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
     # A capacitance may be called C: what an expression names is a constant, and no tolerance of that matrix.
     texts = [
-        text for matrix, given in entries.items() for row, column, text in given if text != _entry(matrix, row, column)
+        text for matrix, cells in entries.items() for row, column, text in cells if text != _entry(matrix, row, column)
     ]
     named = frozenset[str]().union(*(parse_expression(text).names for text in texts))
     for name, value in (constants or {}).items():

@@ -25,7 +25,6 @@ FUNCTION_ROUNDINGS = 8.0
 #: Powers up to this one are Taylor's; every other exponent needs a positive base.
 LARGEST_POWER = 64
 
-
 #: Upper bounds of second derivatives: 3 sqrt(3) / 8 = 0.6496 of atan, 4 / (3 sqrt(3)) = 0.7699 of tanh.
 ATAN_CURVATURE, TANH_CURVATURE = 0.65, 0.77
 

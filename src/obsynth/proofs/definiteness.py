@@ -39,7 +39,6 @@ from obsynth.proofs.extended_balls import Enclosed, Formula, prove_by_ball_arith
 #: The largest order that is tried: 128 takes 0.1 s where 128 bits decide, 0.5 s where nothing does.
 LARGEST_ORDER = 128
 
-
 #: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
 LEAST_SHIFT = 1.0 + 2.0**-5
 
@@ -113,10 +112,10 @@ def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
         return matrix
     ball = Ball.of(matrix)
 
-    def given(kind: type[Enclosed]) -> Enclosed:
+    def constant_formula(kind: type[Enclosed]) -> Enclosed:
         return kind.of(ball)
 
-    return given
+    return constant_formula
 
 
 def _symmetric(ball: Ball) -> Ball:

@@ -25,7 +25,6 @@ from obsynth.numerics.arrays import FloatArray
 #: The prime modulo which ranks are bounded from below first.
 PRIME = (1 << 61) - 1
 
-
 #: Bits of the whole number that, times a power of two, is a double.
 MANTISSA_BITS = 53
 
@@ -41,10 +40,8 @@ ScaledIntegers: TypeAlias = tuple[np.ndarray, int]
 #: Rows of rational numbers.
 FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
-
 #: Digits (binary) in which roots are isolated first, and how often they are doubled.
 FIRST_BITS = 106
-
 
 MOST_DIGIT_DOUBLINGS = 7
 

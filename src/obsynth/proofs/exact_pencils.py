@@ -45,7 +45,6 @@ POINTS_SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
 
-
 #: Binary digits for a pencil of one state, and for each state more.
 BASE_BITS, BITS_PER_STATE = 1200, 60
 

@@ -19,10 +19,8 @@ from obsynth.proofs.balls import Ball
 #: The arithmetics in which a matrix can be formed so that sums and products hold those of all members.
 Enclosed = TypeVar("Enclosed", Ball, "ExtendedBall")
 
-
 #: Digits to try, in bits.
 PRECISION_BITS = (128, 512, 2048)
-
 
 #: Digits (bits) in which all eigenvalues of a matrix are enclosed, and the largest order of which they are: .8 s at 57.
 EIGENVALUE_BITS = (212, 848)

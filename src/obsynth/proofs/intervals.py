@@ -27,7 +27,6 @@ RANGE_SHARE = 1e-3
 #: Boxes that are tried for one range: a function of two parameters takes some hundreds for one part in a thousand.
 MOST_BOXES = 4096
 
-
 #: A box: least and largest value of each argument.
 Part: TypeAlias = tuple[tuple[float, float], ...]
 

@@ -17,7 +17,6 @@ from obsynth.proofs.balls import Ball, rounded_up
 #: computed may have such an entry by its own rounding alone.
 LARGEST_INVERSE = 1e6
 
-
 #: Primes modulo which a determinant is looked at: a number that is not zero is zero modulo both by a chance of 1e-37.
 PRIMES = (2**61 - 1, 2**62 - 57)
 

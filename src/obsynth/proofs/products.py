@@ -36,7 +36,6 @@ FEW_STATES_FOR_BALLS, LARGEST_SHARE_OF_FEW = 8, 1e-12
 #: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
 SHORT_NORM, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
-
 #: So many matrices are multiplied as balls before the coordinates move.
 AT_ONCE = 16
 

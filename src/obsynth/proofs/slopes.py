@@ -90,8 +90,8 @@ def _operation(operation: Callable[..., Any]) -> Callable[..., Any]:
     """Return numpy's operation on values with derivatives."""
     values = interval_operation(operation)
 
-    def done(*given: Any) -> _Dual:
-        parts = [_Dual.of(part) for part in given]
+    def done(*operands: Any) -> _Dual:
+        parts = [_Dual.of(part) for part in operands]
         value = values(*(part.value for part in parts))
         if all(part.slope == _ZERO for part in parts):
             return _Dual(value, _ZERO)

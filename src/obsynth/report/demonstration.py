@@ -27,7 +27,6 @@ SHORTEST_SEGMENT, LONGEST_SEGMENT, CHOSEN = 12, 1500, 150
 #: An observer with this forgetting factor or more, or none, is shown for as long as one with this.
 LONG_MEMORY = 0.99
 
-
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
 HALF_WIDTH, WIDE = 5.6, 6.6
 

@@ -47,14 +47,11 @@ _NAMES_OF_SIGNALS = {
     "parameters": "parameter_names",
 }
 
-
 #: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
 MOST_CURVES, CURVES_UP_TO = 3, 80
 
-
 #: What the meaning of a claim says of its proof, which is left out where checks fail.
 _PROOF_WORDS = re.compile(r"[,:;]? ?\bproved( where the row '[^']*' says so)?\b")
-
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
 STEP_SETTLING_TIMES, MOST_STEP_SAMPLES = 30, 6000

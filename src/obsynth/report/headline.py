@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 DEVIATIONS = 5
 #: Share of the samples of Gaussian noise beyond that level, on either side.
 BEYOND = 2.0 * NormalDist().cdf(-float(DEVIATIONS))
-#: Faults that are told.
-MOST_TOLD = 6
+#: Faults that are reported.
+MOST_LISTED = 6
 
 
 @runtime_checkable
@@ -57,12 +57,12 @@ def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
     if run is not None:
         yield _of_run(run)
     if not design.report.passed:
-        return  # nothing that such a design claims is told as what it can do
+        return  # nothing that such a design claims is reported as what it can do
     lines = list(_of_test(GuaranteedTest.of(design)) if is_guaranteed(design) else _of_estimates(design))
     if lines:
         yield '<div class="detected"><strong>What can be detected</strong><ul>'
-        yield from (f"<li>{escape(line)}</li>" for line in lines[:MOST_TOLD])
-        more = len(lines) - MOST_TOLD
+        yield from (f"<li>{escape(line)}</li>" for line in lines[:MOST_LISTED])
+        more = len(lines) - MOST_LISTED
         yield f"</ul>{f'<p>and {more} more: see Claims.</p>' if more > 0 else ''}</div>"
 
 
@@ -70,7 +70,7 @@ def _of_run(run: DataRun) -> str:
     if not run.events:
         if not (run.statement or run.thresholds):
             sentence = (
-                f"{run.rows} rows, and no rule for alarms: nothing is decided. Give one by --threshold or --monitor."
+                f"{run.rows} rows; no alarm rule is set, so nothing is decided. Set one with --threshold or --monitor."
             )
             return f'<p class="verdict undecided">{sentence}</p>'
         return f'<p class="verdict holds">No alarm in {run.rows} rows.</p>'

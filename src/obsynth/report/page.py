@@ -116,45 +116,47 @@ def html_report(
     digest, own = gain_set_digest(design), {}
     if run is not None:
         own = registered("page_sections_of_run")(design, run, statement, rows)
-    shown = design if report in (None, design.report) else design.replace(report=report)
+    verified = design if report in (None, design.report) else design.replace(report=report)
     # What else the summary says stands in sections of its own.
-    short, facts = summary(shown), tolerance_facts(shown) if _fits(shown) else []
+    short, facts = summary(verified), tolerance_facts(verified) if _fits(verified) else []
     sections = {
         **own,
         "Summary": [
             *fact_rows(short.facts),
             *(f'<p class="warning">Warning: {escape(text)}</p>' for text in short.warnings),
         ],
-        "Pictures": list(_pictures(shown, scenario)),
-        "Zoom": list(zoom_parts(_zooms(shown, scenario, run))),
-        "Claims": [*fact_rows(promises(shown)), *_fault_estimates(shown), *_recovered(shown)],
+        "Pictures": list(_pictures(verified, scenario)),
+        "Zoom": list(zoom_parts(_zooms(verified, scenario, run))),
+        "Claims": [*fact_rows(promises(verified)), *_fault_estimates(verified), *_recovered(verified)],
         "Tolerances": list(fact_rows(facts)) if facts else [],
-        "Noise against delay": list(_delay(shown)),
-        "Notes": list(listed(shown.notes)) if shown.notes else [],
-        "The plant": list(fact_rows(plant_facts(shown.plant))),
-        "Checks": list(check_rows(shown.report.checks)) if shown.report.checks else [],
-        "Gains": list(_gains(shown)),
+        "Noise against delay": list(_delay(verified)),
+        "Notes": list(listed(verified.notes)) if verified.notes else [],
+        "The plant": list(fact_rows(plant_facts(verified.plant))),
+        "Checks": list(check_rows(verified.report.checks)) if verified.report.checks else [],
+        "Gains": list(_gains(verified)),
         "How to reproduce this": list(
-            _reproduction(shown, digest, gains_file, command or _command(shown, gains_file, system_file, data_file))
+            _reproduction(
+                verified, digest, gains_file, command or _command(verified, gains_file, system_file, data_file)
+            )
         ),
     }
     sections = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in sections)
-    state = "holds" if shown.report.passed else "fails"
+    state = "holds" if verified.report.passed else "fails"
     written = datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
     parts = [
-        *headline(shown, run),
-        f'<p class="verdict {state}">{escape(verdict_line(shown.report.checks).plain)}</p>',
+        *headline(verified, run),
+        f'<p class="verdict {state}">{escape(verdict_line(verified.report.checks).plain)}</p>',
         f'<p class="soft">{escape(written)}; obsynth {__version__}; gain set {digest[:12]}</p>',
         f"<nav>{links}</nav>",
     ]
     for heading, lines in sections.items():
         parts += [f'<section id="{_anchor(heading)}">']
-        if heading in FOLDED and shown.report.passed:
+        if heading in FOLDED and verified.report.passed:
             parts += [f"<details><summary><h2>{heading}</h2></summary>", *lines, "</details>", "</section>"]
         else:
             parts += [f"<h2>{heading}</h2>", *lines, "</section>"]
-    return write_atomically(path, standing_page(escape(f"{shown.name}: {shown.method}"), parts))
+    return write_atomically(path, standing_page(escape(f"{verified.name}: {verified.method}"), parts))
 
 
 def _zooms(design: ObserverDesign, scenario: Scenario | None, run: DataRun | None) -> Iterator[str]:

@@ -67,7 +67,8 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
         region = "inside the circle" if sampled else "left of the dashed line"
         yield Picture(
             "Spectrum",
-            f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
+            f"Eigenvalues of the observer: its initial-condition response decays where all are {region}. "
+            "Grey curves: equal damping ratio.",
             drawn((HALF_WIDTH, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
         )
     if design.observer.fault_names:
@@ -132,25 +133,25 @@ def shown_simulation(design: ObserverDesign, scenario: Scenario | None) -> tuple
 
 def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
     """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
-    demonstration, given = shown_simulation(design, scenario), scenario is not None
+    demonstration, is_stated = shown_simulation(design, scenario), scenario is not None
     if demonstration is None:
         return
-    shown, simulation = demonstration
+    used, simulation = demonstration
     linear = isinstance(design.observer, LinearObserver)
-    what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
-    text = f"{what}: {_story(shown, given=given, linear=linear)}"
+    what = "On the scenario" if is_stated else "Each fault in turn" if linear else "Each parameter in turn"
+    text = f"{what}: {_story(used, is_stated=is_stated, linear=linear)}"
     faults, states = len(design.observer.fault_names), simulation.estimates.state_names
     units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    seen = [*_watched(design, shown, simulation)] if given else []
-    if faults or seen:
+    first_detections = [*_watched(design, used, simulation)] if is_stated else []
+    if faults or first_detections:
         yield stacked(
             "The design at work",
             text,
-            faults + len(seen),
-            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
+            faults + len(first_detections),
+            lambda axes: plot_simulation(simulation, detections=first_detections, units=units, axes=axes),
         )
     if 0 < len(states) <= MOST_DRAWN_STATES:
-        run = "in the same run" if faults or seen else "in a run with the stated noise"
+        run = "in the same run" if faults or first_detections else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
         yield stacked(
             "States",
@@ -166,8 +167,8 @@ def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation)
         yield from registered("detections")(design, scenario, simulation)
 
 
-def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
-    if given:
+def _story(scenario: Scenario, *, is_stated: bool, linear: bool) -> str:
+    if is_stated:
         return f"{scenario.horizon:g} s, seed {scenario.seed}."
     if not linear:
         return (

@@ -40,7 +40,6 @@ _COLUMN_MEANINGS = (
     "estimates the fault."
 )
 
-
 #: Conditions that ask for another time than the plant's, and what to do about each.
 _TIME_CONDITIONS = {
     "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
@@ -52,7 +51,6 @@ _TIME_CONDITIONS = {
 _ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
 
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
-
 
 _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
 

@@ -31,24 +31,24 @@ def worst_rows(title: str, rows: list[Any], size: Callable[[Any], float]) -> tup
 
 def simulation_report(
     name: str,
-    found: Simulation,
+    simulation: Simulation,
     *,
     console: Console,
     units: Mapping[str, str],
     file: str | None = None,
 ) -> None:
     """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others."""
-    summary = found.summary()
-    console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
+    summary = simulation.summary()
+    console.print(Text(f"{name}: {summary['samples']} samples, {simulation.time[-1]:g} s", style="bold"))
     console.print()
-    linear = not found.estimates.has_deviations
+    linear = not simulation.estimates.has_deviations
     for kind, title in (
         ("faults", "Fault estimates" if linear else "Parameter estimates"),
         ("states", "State estimates"),
     ):
         if not summary[kind]:
             continue
-        lasts, rounding = _last_column(found, kind), _rounding(found, kind)
+        lasts, rounding = _last_column(simulation, kind), _rounding(simulation, kind)
         table = headed_table("signal", "RMSE", "largest error", next(lasts), "unit")
         title, rows = worst_rows(
             title, list(zip(summary[kind].items(), lasts, strict=True)), lambda row: row[0][1]["rmse"]
@@ -70,22 +70,28 @@ def simulation_report(
         console.print(Text(f"Written: {file}"))
 
 
-def _rounding(found: Simulation, kind: str) -> dict[str, float]:
+def _rounding(simulation: Simulation, kind: str) -> dict[str, float]:
     """Return by signal the size of errors that are only rounding: a share of its largest value."""
-    shown = found.estimates
+    estimates = simulation.estimates
     if kind == "faults":
-        names, truth, values = shown.fault_names, found.faults[:, list(found.fault_columns)], shown.faults
+        names, truth, values = (
+            estimates.fault_names,
+            simulation.faults[:, list(simulation.fault_columns)],
+            estimates.faults,
+        )
     else:
-        names, truth, values = shown.state_names, found.states, shown.states
+        names, truth, values = estimates.state_names, simulation.states, estimates.states
     sizes = np.nanmax(np.abs(np.vstack([truth, np.nan_to_num(values)])), axis=0, initial=0.0)
     return dict(zip(names, (ROUNDING_SHARE * sizes).tolist(), strict=True))
 
 
-def _last_column(found: Simulation, kind: str) -> Iterator[str]:
+def _last_column(simulation: Simulation, kind: str) -> Iterator[str]:
     """Yield a heading, and a cell for each signal: delays of a linear observer, coverage of a recursive one."""
-    if not found.estimates.has_deviations:
+    if not simulation.estimates.has_deviations:
         yield "delay (samples)"
-        yield from map(str, found.estimates.fault_delays if kind == "faults" else found.estimates.state_delays)
+        yield from map(
+            str, simulation.estimates.fault_delays if kind == "faults" else simulation.estimates.state_delays
+        )
     else:
         yield "in its 95 % band"
-        yield from (f"{100.0 * row['within_band']:.0f} %" for row in found.summary()[kind].values())
+        yield from (f"{100.0 * row['within_band']:.0f} %" for row in simulation.summary()[kind].values())

@@ -78,9 +78,9 @@ def simulation_plots(simulation: Any, units: Mapping[str, str]) -> Iterator[str]
     """Yield a plot of each fault (or parameter) with its estimate."""
     estimates, time = simulation.estimates, simulation.time
     true = simulation.faults[:, list(simulation.fault_columns)]
-    shown = estimates.parameters if estimates.has_deviations else estimates.faults
+    estimated = estimates.parameters if estimates.has_deviations else estimates.faults
     for i, name in enumerate(estimates.fault_names):
-        lines = [("truth", "true", true[:, i]), ("estimate", "estimate", shown[:, i])]
+        lines = [("truth", "true", true[:, i]), ("estimate", "estimate", estimated[:, i])]
         yield zoomable(with_unit(name, units), time, lines)
 
 

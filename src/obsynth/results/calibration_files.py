@@ -20,7 +20,6 @@ CALIBRATION_VERSION = 1
 
 _SOURCE = "the calibration file"
 
-
 #: Ranges found again on another machine may differ by this share of their width.
 SAME_WIDTH = 1e-2
 

@@ -30,7 +30,6 @@ RESULT_VERSION = 1
 #: Digits of a digest that a sentence shows.
 SHOWN_DIGITS = 12
 
-
 #: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
 SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
 
@@ -77,13 +76,13 @@ def opened(
 def result_text(
     kind: str,
     designs: Mapping[str, ObserverDesign],
-    asked: Mapping[str, Any],
+    options: Mapping[str, Any],
     result: Mapping[str, Any],
     statement: str,
     log: Mapping[str, Any] | None = None,
 ) -> str:
     """Return the certificate of a result: what was asked, the figures, the sentence, and every gain set inside."""
-    body = plain({"statement": statement, "asked": asked, "result": result, "log": log})
+    body = plain({"statement": statement, "asked": options, "result": result, "log": log})
     inside = {name: design_as_dict(design) for name, design in designs.items()}
     return sealed(kind, RESULT_VERSION, {**body, "gain_sets": inside})
 

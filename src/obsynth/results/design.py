@@ -36,9 +36,7 @@ if TYPE_CHECKING:
 
 OfObserver = TypeVar("OfObserver")
 
-
 OfPlant = TypeVar("OfPlant")
-
 
 #: Checks that a mark names; the others are counted.
 _MOST_NAMED_CHECKS = 4

@@ -42,9 +42,7 @@ MOST_GAIN_SET_CHARACTERS = 2_000_000_000
 
 _HEAD_BYTES = 256
 
-
 _Made = TypeVar("_Made")
-
 
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"

@@ -27,7 +27,6 @@ SAME_NUMBER = 1e-9
 #: Values that are listed; the others are counted.
 MOST_LISTED_VALUES = 8
 
-
 #: On narrower terminals the claim stands below the numbers, over the whole width.
 WIDE_ENOUGH = 110
 
@@ -43,7 +42,7 @@ _KIND_WIDTH = 14
 
 #: From these sizes on a number has an exponent (of ten), and commas.
 LEAST_WITH_EXPONENT, LEAST_WITH_COMMAS = 7, 10_000
-#: A time is told in a longer unit as well from so many of it on.
+#: A time is reported in a longer unit as well from so many of it on.
 LONG_TIMES = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 10.0))
 
 #: Rows of information that are true or false.

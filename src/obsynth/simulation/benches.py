@@ -51,7 +51,6 @@ STABILISED = (
     "it."
 )
 
-
 #: Observers that a bench runs.
 BenchObserver: TypeAlias = LinearObserver | RecursiveObserver | DAEObserver | ScheduledObserver | RegionObserver
 

@@ -1,4 +1,5 @@
-"""How one signal of a scenario goes with time; between samples it is held or linear, so that simulations are exact.
+"""Profiles: how one signal of a scenario depends on time; between samples it is held or linear, as exact simulation
+needs.
 
 A profile acts from the first sample at or after ``start`` until the last one before ``end``.
 """
@@ -73,6 +74,18 @@ class Step(Additive):
         In the signal's unit.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.Step(size=0.5, start=2.0).sampled(4, 1.0)  # at both ends of four intervals of 1 s
+    >>> left
+    array([0. , 0. , 0.5, 0.5])
     """
 
     size: float
@@ -88,9 +101,21 @@ class Ramp(Additive):
     Parameters
     ----------
     rate : float
-        Per second.
+        In the signal's unit per second.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.Ramp(rate=0.5, start=1.0).sampled(4, 1.0)
+    >>> left, right
+    (array([0. , 0. , 0.5, 1. ]), array([0. , 0.5, 1. , 1.5]))
     """
 
     held: ClassVar[bool] = False
@@ -114,6 +139,18 @@ class Sine(Additive):
         At t = 0.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.Sine(amplitude=2.0, frequency=math.pi / 2).sampled(4, 1.0)
+    >>> left.round(6) + 0.0
+    array([ 0.,  2.,  0., -2.])
     """
 
     held: ClassVar[bool] = False
@@ -132,11 +169,23 @@ class Drift(Additive):
     Parameters
     ----------
     size : float
-        Where it ends.
+        Where it ends, in the signal's unit.
     time_constant : float, seconds
         After which 63 % are reached.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, ``end`` is not after ``start``, or the time constant is not positive.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.Drift(size=1.0, time_constant=2.0).sampled(4, 1.0)
+    >>> left.round(3)
+    array([0.   , 0.393, 0.632, 0.777])
     """
 
     held: ClassVar[bool] = False
@@ -150,18 +199,30 @@ class Drift(Additive):
 
 @dataclass(frozen=True, kw_only=True)
 class Intermittent(Additive):
-    """A constant that comes and goes.
+    """A constant that is there in a part of each period, and zero in the rest.
 
     Parameters
     ----------
     size : float
-        While it is there.
+        In the signal's unit, while it is there.
     period : float, seconds
-        From one coming to the next.
+        From the start of one part to that of the next.
     duty : float, optional
         Share of the period during which it is there, between 0 and 1.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite or out of its range, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.Intermittent(size=1.0, period=4.0, duty=0.25).sampled(8, 1.0)
+    >>> left
+    array([1., 0., 0., 0., 1., 0., 0., 0.])
     """
 
     size: float
@@ -175,14 +236,26 @@ class Intermittent(Additive):
 
 @dataclass(frozen=True, kw_only=True)
 class Stuck(Profile):
-    """An actuator or a sensor that stays where it is.
+    """An actuator or a sensor that is stuck at one value.
 
     Parameters
     ----------
     value : float, optional
-        Where; by default where it is when this begins.
+        At which value, in the signal's unit; by default the one that it has at ``start``.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> scenario = obsynth.Scenario(horizon=60.0, sample_time=1.0, sensors={"level": obsynth.Stuck(start=20.0)})
+    >>> scenario.sensors["level"]
+    (Stuck(start=20.0, end=inf, value=None),)
     """
 
     value: float | None = None
@@ -198,6 +271,18 @@ class LostEffectiveness(Profile):
         What is lost, between 0 (nothing) and 1 (all).
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        The share is not above 0 and at most 1, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> lost = obsynth.LostEffectiveness(share=0.3, start=20.0)  # the pump gives 70 % of its command from 20 s on
+    >>> obsynth.Scenario(horizon=60.0, sample_time=1.0, faults={"pump": lost}).faults["pump"][0].share
+    0.3
     """
 
     share: Annotated[float, Gt(0.0), Le(1.0)]
@@ -225,6 +310,17 @@ class Uniform(Random):
         The limits.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, ``high`` is not above ``low``, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> obsynth.Uniform(low=-1.0, high=3.0).moments()  # largest absolute value, mean, variance
+    (3.0, 1.0, 1.3333333333333333)
     """
 
     low: float
@@ -255,6 +351,17 @@ class Gaussian(Random):
         Their mean.
     start, end : float, optional, seconds
         When it acts.
+
+    Raises
+    ------
+    SpecError
+        A number is not finite, the deviation is not positive, or ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> obsynth.Gaussian(deviation=0.5).moments()  # no largest value, mean, variance
+    (inf, 0.0, 0.25)
     """
 
     deviation: Positive

@@ -44,7 +44,6 @@ PROFILE_KINDS: dict[str, type[Profile]] = {
     "gaussian": Gaussian,
 }
 
-
 _ADDITIVE = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Additive))
 
 #: A failing actuator or sensor: no function of time, and a signal's only profile.
@@ -76,7 +75,7 @@ Profiles = Mapping[str, Profile | Sequence[Profile]]
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What happens to a plant, signal by signal; profiles of one signal add up.
+    """The inputs, faults, disturbances and noise of a simulation, by signal; several profiles of one signal add up.
 
     Parameters
     ----------
@@ -109,7 +108,17 @@ class Scenario:
     Raises
     ------
     SpecError
-        A number is out of range, or a profile stands where it cannot be.
+        A number is out of range, or a profile is of a kind that its signal cannot have.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], B=[[1]], C=[[1]], Bf=[[1]], dt=1, fault_names=["pump"])
+    >>> scenario = obsynth.Scenario(horizon=60.0, faults={"pump": obsynth.Step(size=0.5, start=20.0)})
+    >>> simulation = obsynth.simulate(obsynth.fault_estimation_filter(plant), scenario)
+    >>> simulation.faults[[19, 20]]
+    array([[0. ],
+           [0.5]])
     """
 
     horizon: float

@@ -34,14 +34,11 @@ from obsynth.simulation.signals import Trajectory
 #: An initial state that is off by less than this, relative to its size, is off by rounding only.
 CONSISTENCY_TOLERANCE = 1e-9
 
-
 #: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
 SIMULATED_SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[", suffix=".csv")
 
-
 #: Columns beside inputs and outputs that hold deviations from an operating point.
 _OF_THE_POINT = ("x[{}]", "xhat[{}]", "f[{}]", "fhat[{}]", "d[{}]")
-
 
 #: What simulates a plant alone.
 _PLANT_SIMULATIONS: dict[type, Callable[..., Trajectory]] = {

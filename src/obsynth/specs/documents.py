@@ -28,14 +28,11 @@ if TYPE_CHECKING:
 #: Values that the aliases of a document may repeat it to.
 MOST_ALIASED_VALUES = 1_000_000
 
-
 #: Whole numbers from here on are not printed.
 LONGEST_NUMBER = 1e15
 
-
 #: A document with more problems than this is not read to its end by anybody.
 MAXIMUM_PROBLEMS = 25
-
 
 #: What the checks call a kind of value, in a path to a problem.
 _KIND = re.compile(r"<\w+>")

@@ -35,12 +35,10 @@ _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
 
 _LABELS = ("operating_point", "scales", "units")
 
-
 #: Noise of a nonlinear plant, which its linear model or the options of a method take; and what `with_noise` takes.
 _TAKEN_NOISE = ("sensor_noise", "process_noise")
 
 _NOISE_MODEL = ("sensor_noise", "offset", "walks")
-
 
 #: Signals that name the columns of a matrix; rows are equations (states) or outputs.
 _COLUMN_NAMES = {

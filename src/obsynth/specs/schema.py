@@ -21,7 +21,6 @@ SPEC_VERSION = 1
 #: Kinds of plants beside those with constant matrices.
 RARE_KINDS = ("time-varying", "dae")
 
-
 _PROFILE_KEYS = [item.name for profile in PROFILE_KINDS.values() for item in fields(profile)]
 
 #: Keys of profiles that are times; they may be negative.
@@ -35,7 +34,6 @@ ProfileSection: Any = create_model(  # type: ignore[call-overload]
     kind=(Literal[tuple(PROFILE_KINDS)], ...),
     **{name: (_ProfileTime if name in _PROFILE_TIMES else float | None, None) for name in _PROFILE_KEYS},
 )
-
 
 #: The sections of a spec that are checked by themselves: those which it has not are not made.
 CHECKED_APART = ("plant", "scenario", "inputs", "calibrate")

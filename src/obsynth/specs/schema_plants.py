@@ -37,7 +37,6 @@ EquationMatrix = Annotated[
     Rows | Annotated[MatrixFile, Tag(FILE_TAG)] | Annotated[StatePick, Tag(PICKED)], Discriminator(kind_of_matrix)
 ]
 
-
 _COLOURED = "<coloured>"
 
 #: Offsets and walks: a number, or what a calibration is to find.

@@ -53,7 +53,6 @@ _ROWS, FILE_TAG, PICKED, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
     "<one>",
 )
 
-
 Text = Annotated[str, Field(min_length=1)]
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -85,7 +84,6 @@ def in_seconds(value: Any) -> Any:
 PositiveTime = Annotated[Positive, BeforeValidator(in_seconds)]
 
 Time = Annotated[NonNegative, BeforeValidator(in_seconds)]
-
 
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
 

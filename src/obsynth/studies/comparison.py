@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: Samples of the window on which the least threshold is looked for, at most.
 LONGEST_WINDOW = 32
 
-#: How far a signal reaches is told by this share of its samples.
+#: How far a signal reaches is judged by this share of its samples.
 SHOWN_SAMPLES = 0.98
 
 #: Room below and above a fault in its panel, as a share of its range.
@@ -367,8 +367,8 @@ class Comparison:
         str
             Each header with its meaning.
         """
-        shown = self._header if columns is None else columns
-        texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in shown if name in _FIGURE_MEANINGS]
+        columns_drawn = self._header if columns is None else columns
+        texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns_drawn if name in _FIGURE_MEANINGS]
         return "; ".join(texts) + f". {_OF_THE_EXACT_MODEL}"
 
     @property
@@ -464,6 +464,7 @@ class Comparison:
         columns = 3 if any(far) else 2
         figure = new_figure(figsize=(3.5 + 3.75 * (columns - 1), 2.8 * count), layout="constrained")
         axes = figure.subplots(count, columns, squeeze=False)
+        figure.align_ylabels(axes)
         for row, name in enumerate(self.fault_names):
             left_panel, *panels = axes[row]
             sets = ([entry for entry in drawn if entry not in far[row]], far[row])

@@ -29,7 +29,6 @@ _DECISIONS = {
     "isolation_error_rate": ("wrong fault named", "share of detections"),
 }
 
-
 #: Columns left out where the console is narrower than so many characters.
 NARROW = 160
 

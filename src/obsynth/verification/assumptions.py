@@ -89,9 +89,9 @@ class Assumptions:
             phrases.append(self._noise())
         elif self.noise_left_out:
             phrases.append("no noise, as the scenario has none")
-        for given, what in ((self.initial_set, "a start"), (self.state_bounds, "states")):
-            if given is not None:
-                each = [f"{name} {_range(value, plant.units.get(name, ''))}" for name, value in given.items()]
+        for ranges, what in ((self.initial_set, "a start"), (self.state_bounds, "states")):
+            if ranges is not None:
+                each = [f"{name} {_range(value, plant.units.get(name, ''))}" for name, value in ranges.items()]
                 phrases.append(f"{what} with {_enough(each, 'each state within its bound')}")
         if self.initial_error is not None:
             size = shown(float(f"{self.initial_error:.6g}"))
@@ -133,11 +133,11 @@ def _range(value: Any, unit: str) -> str:
     return f"within {shown(value, unit)}"
 
 
-def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
+def _listed(bounds: Mapping[str, Any]) -> dict[str, Any]:
     """Return bounds of states as plain data."""
     pairs = {
         name: [float(end) for end in value] if isinstance(value, (list, tuple, np.ndarray)) else float(value)
-        for name, value in given.items()
+        for name, value in bounds.items()
     }
     return dict(sorted(pairs.items()))
 

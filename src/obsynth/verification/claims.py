@@ -27,7 +27,6 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 #: Gains smaller than this are compared as they are.
 LEAST_GAIN_SIZE = 1e-12
 
-
 #: Every claim a fault-estimation filter can make.
 KNOWN_CLAIMS = ("gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high", "state_lag")
 
@@ -36,7 +35,6 @@ ORDER_TOLERANCE = 1e-6
 
 #: Why a variance is not known.
 UNCERTAIN = "at rounding level: two ways of computing it disagree"
-
 
 #: In place of a row: what the search stated, which no check recomputes.  Such a claim has a row that says so.
 STATED_BY_SEARCH = "stated by the search"
@@ -106,7 +104,7 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
     if wrong:
         return
     names = [name for name in recovery.names if name in plant.state_names]
-    whole = np.hstack(
+    states = np.hstack(
         [
             recovery.from_state,
             recovery.from_input,
@@ -116,11 +114,11 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
         ]
     )
     rows = [recovery.names.index(name) for name in names]
-    expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in names]]
+    expected = np.eye(plant.nx, states.shape[1])[[plant.state_names.index(name) for name in names]]
     yield upper_bound_check(
         "recovery of kept states",
         "a state that the plant still has is recovered as itself",
-        float(np.max(np.abs(whole[rows] - expected), initial=0.0)),
+        float(np.max(np.abs(states[rows] - expected), initial=0.0)),
         EQUALITY_TOLERANCE,
         source=source,
         kind="equality",
@@ -223,10 +221,10 @@ def fault_noise_rows(errors: ErrorModel) -> Iterator[Check]:
     plant = errors.plant
     if not plant.nw:
         return
-    shown, _, _, direct = errors.fault_output
+    to_faults, _, _, direct = errors.fault_output
     # What noise does to an estimate at once has no finite variance in continuous time, and is left out.
     direct_noise = direct if plant.dt > 0.0 else 0.0 * direct
-    covariance = certain_noise_covariance(errors.Az, errors.noise, shown, direct_noise, plant.dt)
+    covariance = certain_noise_covariance(errors.Az, errors.noise, to_faults, direct_noise, plant.dt)
     for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
         yield information(
             f"noise in fhat[{name}]",
@@ -257,12 +255,12 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 def listed_gains(
-    design: ObserverDesign, found: Mapping[str, FloatArray], *, tolerance: float = EQUALITY_TOLERANCE
+    design: ObserverDesign, recomputed: Mapping[str, FloatArray], *, tolerance: float = EQUALITY_TOLERANCE
 ) -> Check:
     """Return the row on the listed gains, which run; of a recursion they are those of the last step looked at."""
-    wrong = [letter for letter in design.gains if letter not in found]
+    wrong = [letter for letter in design.gains if letter not in recomputed]
     gap = 0.0
-    for letter, matrix in found.items():
+    for letter, matrix in recomputed.items():
         listed = design.gains.get(letter, matrix)
         if listed.shape != matrix.shape:
             wrong.append(letter)

@@ -181,13 +181,13 @@ def driven_by(kind: type[Enclosed], B: FloatArray, gain: FloatArray, D: FloatArr
     return above if k == len(B) else block([[above], [kind.exact(B[k:])]])
 
 
-def _each(given: Any, name: str, count: int) -> tuple[FloatArray, ...]:
+def _each(entry: Any, name: str, count: int) -> tuple[FloatArray, ...]:
     """Return a matrix at each vertex."""
-    several = not isinstance(given, np.ndarray) and len(given) and np.ndim(given[0]) == 2
-    several = several or (isinstance(given, np.ndarray) and given.ndim == 3)
+    several = not isinstance(entry, np.ndarray) and len(entry) and np.ndim(entry[0]) == 2
+    several = several or (isinstance(entry, np.ndarray) and entry.ndim == 3)
     if not several:
-        return (as_matrix(given, name),) * count
-    matrices = tuple(as_matrix(matrix, name) for matrix in given)
+        return (as_matrix(entry, name),) * count
+    matrices = tuple(as_matrix(matrix, name) for matrix in entry)
     if len(matrices) != count:
         raise SpecError(f"{name} is given at {len(matrices)} vertices, A at {count}.", path=name)
     return matrices

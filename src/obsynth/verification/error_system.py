@@ -129,11 +129,11 @@ class ErrorModel:
         if self.Phi is None or self.Cw is None:
             return e, a, b, c
         nx, count = len(a), len(self.Phi)
-        whole, moved = np.eye(nx + count), np.zeros((nx + count, nx + count))
-        whole[:nx, :nx], moved[:nx, :nx] = e, a
-        moved[: self.plant.nx, nx:], moved[nx:, nx:] = self.plant.Bf @ self.Cw, self.Phi
+        e_augmented, a_augmented = np.eye(nx + count), np.zeros((nx + count, nx + count))
+        e_augmented[:nx, :nx], a_augmented[:nx, :nx] = e, a
+        a_augmented[: self.plant.nx, nx:], a_augmented[nx:, nx:] = self.plant.Bf @ self.Cw, self.Phi
         c = np.hstack([c, self.plant.Df @ self.Cw])
-        return whole, moved, np.vstack([b, np.zeros((count, self.plant.nu))]), c
+        return e_augmented, a_augmented, np.vstack([b, np.zeros((count, self.plant.nu))]), c
 
     @property
     def E(self) -> FloatArray:
@@ -197,7 +197,7 @@ class ErrorModel:
         return bool(
             self.lag >= 0
             and (self.Phi is None) == (self.Cw is None)
-            and all(np.shape(given) == wanted for given, wanted in shapes)
+            and all(np.shape(matrix) == wanted for matrix, wanted in shapes)
             and set(observer.state_names) <= set(plant.state_names)
             and set(observer.fault_names) <= set(plant.fault_names)
             and not any(delay != self.lag for delay in observer.state_delays)
@@ -311,11 +311,11 @@ class ErrorModel:
             units = natural_scaling(self.plant).states
         te, c = size(self.T) @ size(self.E), size(self.C)
         formed = size(observer.Az) @ te + size(observer.By) @ c + size(self.T) @ size(self.A)
-        shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
+        estimates = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
         if self.T0 is not None:
-            shown = shown + size(self.T0) @ size(self.A)
+            estimates = estimates + size(self.T0) @ size(self.A)
         state_sizes, output_sizes = (
-            np.max(terms * units, axis=1, initial=0.0, keepdims=True) for terms in (formed, shown)
+            np.max(terms * units, axis=1, initial=0.0, keepdims=True) for terms in (formed, estimates)
         )
         return units, np.where(state_sizes > 0.0, state_sizes, 1.0), np.where(output_sizes > 0.0, output_sizes, 1.0)
 

@@ -20,13 +20,11 @@ from obsynth.verification.error_system import ErrorModel, natural_scaling
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
 
-#: Sizes of states that are told by what drives them alone are known to within this factor.
+#: Sizes of states that follow from what drives them alone are known to within this factor.
 STATE_SCALE_FACTOR = 4.0
-
 
 #: What an observer of the plant's own states has in common with it.
 ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
-
 
 #: Identities whose columns are states.
 _OF_STATES = ("dynamics", "state estimate", "fault estimate", "residual")

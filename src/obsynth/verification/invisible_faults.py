@@ -210,8 +210,8 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
 def has_index_one(plant: DescriptorSystem) -> bool:
     """Whether every trajectory can be continued after now without inputs: ``rank [E A; 0 E] = n + rank E``."""
     nothing = np.zeros_like(plant.E)
-    whole = np.block([[plant.E, plant.A], [nothing, plant.E]])
-    return decide_rank(whole).rank == plant.nx + decide_rank(plant.E).rank
+    pencil = np.block([[plant.E, plant.A], [nothing, plant.E]])
+    return decide_rank(pencil).rank == plant.nx + decide_rank(plant.E).rank
 
 
 def _grows(point: Any, plant: DescriptorSystem) -> bool:
@@ -342,12 +342,12 @@ class _Trajectories:
         """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
         points = [m.point for m in self.members]
         faults, noise, states = self._part("f"), self._part("w"), list[Any]()
-        shown = faults
+        estimates = faults
         for model in self.setting.models:
-            inner, shown = _through(model, shown, points)
+            inner, estimates = _through(model, estimates, points)
             states.append(inner)
         weights = _weights(points, discrete=self.plant.is_discrete)
-        energies = [_weighted(part, weights) for part in (shown, noise)]
+        energies = [_weighted(part, weights) for part in (estimates, noise)]
         if not self.samples:
             return energies[0], energies[1]
         estimated = self.plant.nf if self.setting.exact else 0

@@ -117,8 +117,8 @@ class InvisiblePairs:
             reached = larger
         places = _pivot_rows(reached)
         top, image = picked_rows(starts, places), picked_rows(images, places)
-        shown = (z * starts * square + zd * ends) / (square * square)
-        return cls(reached, top, ends, image, shown, z * reached / square, fmpq_mat(zd) / (square * square))
+        estimates = (z * starts * square + zd * ends) / (square * square)
+        return cls(reached, top, ends, image, estimates, z * reached / square, fmpq_mat(zd) / (square * square))
 
     def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""

@@ -24,12 +24,12 @@ def drive_of(
     SpecError
         A name is unknown, a size is not positive, or an output or a fault has none.
     """
-    given = _checked(noise, "noise")
+    noise_sizes = _checked(noise, "noise")
     columns: list[FloatArray] = []
     n, ny = len(terms.names), len(terms.output_names)
     sizes: dict[str, float] = {}
     moving = terms.names[: terms.differential]
-    for name, size in given.items():
+    for name, size in noise_sizes.items():
         state = name.removeprefix("der(").removesuffix(")").strip() if name.startswith("der(") else name
         if name in terms.output_names:
             sizes[name] = size
@@ -39,7 +39,7 @@ def drive_of(
             known = (*terms.output_names, *terms.faults, *(f"der({each})" for each in moving))
             raise SpecError(f"noise names {name!r}; there are: {', '.join(known)}.", path=f"noise.{name}")
     missing = [name for name in terms.output_names if name not in sizes]
-    missing += [name for name in terms.faults if name not in given and f"der({name})" not in given]
+    missing += [name for name in terms.faults if name not in noise_sizes and f"der({name})" not in noise_sizes]
     if missing:
         raise SpecError(
             f"noise says nothing of {', '.join(map(repr, missing))}: give the standard deviation of a sample for each "
@@ -88,10 +88,10 @@ def in_words(terms: NonlinearTerms, wanted: FloatArray) -> str:
     return ", ".join(words)
 
 
-def _checked(given: Mapping[str, Any] | None, what: str) -> dict[str, float]:
-    if not isinstance(given, Mapping) or not given:
+def _checked(sizes: Mapping[str, Any] | None, what: str) -> dict[str, float]:
+    if not isinstance(sizes, Mapping) or not sizes:
         raise SpecError(f"{what} must name signals with their sizes, such as {{'gauge': 0.001}}.", path=what)
-    for name, size in given.items():
+    for name, size in sizes.items():
         if not (is_finite_number(size) and size > 0.0):
             raise SpecError(f"{what} of {name!r} is {shown(size)}: give a positive number.", path=f"{what}.{name}")
-    return {str(name): float(size) for name, size in given.items()}
+    return {str(name): float(size) for name, size in sizes.items()}

@@ -150,19 +150,19 @@ def _regular_around(pencil: Ball, n: int, frequency: float) -> float:
         return -1.0
     if not np.all(np.isfinite(inverse)):
         return -1.0
-    whole = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
+    inverse_blocks = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
     turned = Ball.exact(frequency * turning)
     matrix = Ball.blocks([[pencil, turned], [-turned, pencil]])
-    missed = Ball.exact(whole) @ matrix - Ball.exact(np.eye(2 * size))
+    missed = Ball.exact(inverse_blocks) @ matrix - Ball.exact(np.eye(2 * size))
     # The frequency enters the equations of the states alone: the others count for little in weighted norms.
     states = np.r_[0 : 2 * n, size : size + 2 * n]
     weights = np.full(2 * size, LIGHT)
     weights[states] = 1.0
-    left = _row_sum((np.abs(missed.midpoint) + missed.radius) * weights[:, None] / weights)
-    speed = _row_sum(np.abs(whole[:, states]) * weights[:, None])
-    if not left < 1.0 or not np.isfinite(speed):
+    error_norm = _row_sum((np.abs(missed.midpoint) + missed.radius) * weights[:, None] / weights)
+    speed = _row_sum(np.abs(inverse_blocks[:, states]) * weights[:, None])
+    if not error_norm < 1.0 or not np.isfinite(speed):
         return -1.0
-    return REACH * (1.0 - left) / speed if speed > 0.0 else np.inf
+    return REACH * (1.0 - error_norm) / speed if speed > 0.0 else np.inf
 
 
 def _row_sum(sizes: FloatArray) -> float:
@@ -177,7 +177,7 @@ def _is_above_at(work: Transfer, level: float, frequency: float) -> bool:
     into = Ball.blocks([[work.B, Ball.exact(np.zeros((n, m)))], [Ball.exact(np.zeros((n, m))), work.B]])
     out = Ball.blocks([[work.C, Ball.exact(np.zeros((size, n)))], [Ball.exact(np.zeros((size, n))), work.C]])
     zero = Ball.exact(np.zeros((size, m)))
-    shown = Ball.blocks([[work.D, zero], [zero, work.D]])
+    response = Ball.blocks([[work.D, zero], [zero, work.D]])
     if n:
         turned = Ball.exact(frequency * np.eye(n))
         matrix = Ball.blocks([[-work.dynamics, -turned], [turned, -work.dynamics]])
@@ -186,16 +186,16 @@ def _is_above_at(work: Transfer, level: float, frequency: float) -> bool:
         except np.linalg.LinAlgError:
             return False
         solution = inverse @ into.midpoint
-        left = Ball.exact(np.eye(2 * n)) - Ball.exact(inverse) @ matrix
-        share = _row_sum(np.abs(left.midpoint) + left.radius)
+        remainder = Ball.exact(np.eye(2 * n)) - Ball.exact(inverse) @ matrix
+        share = _row_sum(np.abs(remainder.midpoint) + remainder.radius)
         missed = into - matrix @ Ball.exact(solution)
         error = _row_sum(np.abs(inverse)) * float(np.max(np.abs(missed.midpoint) + missed.radius, initial=0.0))
         if not share < 1.0:
             return False
         solved = Ball(solution, np.full_like(solution, float(rounded_up(np.array(error / (1.0 - share)), 6))))
-        shown = shown + out @ solved
+        response = response + out @ solved
     least: FloatArray = np.asarray(level**2 * np.eye(2 * m), dtype=np.float64)
-    return prove_positive_definite(shown.T @ shown - Ball.exact(least)).proved
+    return prove_positive_definite(response.T @ response - Ball.exact(least)).proved
 
 
 def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray) -> Transfer:
@@ -220,5 +220,5 @@ def added_gain(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray,
         return np.inf
     # Sums over time of absolute responses bound every entry of a transfer on the axis.
     moved = plant_itself.gain(np.eye(plant.nx), b)
-    shown = rounded_up(own.gain(observer.Cz, k.midpoint, k.radius) + j.magnitude, 2)
-    return Ball.exact(moved).frobenius_norm * Ball.exact(shown).frobenius_norm * (1.0 + 4.0 * UNIT_ROUNDOFF)
+    gain = rounded_up(own.gain(observer.Cz, k.midpoint, k.radius) + j.magnitude, 2)
+    return Ball.exact(moved).frobenius_norm * Ball.exact(gain).frobenius_norm * (1.0 + 4.0 * UNIT_ROUNDOFF)

@@ -28,11 +28,10 @@ from obsynth.results.plant_source import PlantSource
 from obsynth.verification.error_system import ErrorModel, contraction_of
 
 #: Imaginary parts below this are not shown.
-SHOWN_AS_REAL = 1e-12
+PRINTED_AS_REAL = 1e-12
 
 #: Eigenvalues that are listed; the others are counted.
 MOST_EIGENVALUES = 6
-
 
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of
 #: sums.
@@ -44,19 +43,15 @@ _STORED_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
 
 _SOURCE = "the plant as written, eliminated and sampled again"
 
-
 _INTERVAL_PARTS = ("midpoint", "radius")
-
 
 #: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
 STEPS_OF_INFORMATION = 8_192
-
 
 #: The middle plant of the family and the plant of the design differ by rounding: this share of their largest entries.
 FAMILY_TOLERANCE = 1e-9
 
 STORED_TWICE = "the gain set: what is stored twice is compared"
-
 
 #: What both plants say of the signals that neither elimination nor sampling touches.
 _KEPT_NAMES = tuple(name for name in SIGNAL_NAMES if name not in ("state_names", "noise_names"))
@@ -78,7 +73,7 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
         admissible = not unstable_poles(plant) and (structure.index or 0) <= 1
         verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
         ordered = sorted((complex(value) for value in structure.finite_eigenvalues), key=abs, reverse=True)
-        texts = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in ordered]
+        texts = [f"{v.real:.4g}" if abs(v.imag) < PRINTED_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in ordered]
         rows += [
             ("index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), ""),
             (

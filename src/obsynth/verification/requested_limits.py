@@ -55,11 +55,14 @@ def requested_rows(
     those that no gain moves, and is called where a row fails without it.
     """
     options, observer = design.options, design.observer
-    asked = {name: bounds for name, bounds in limits.items() if options.get(name) is not None}
-    if asked:
-        wrong = [text for name, bounds in asked.items() for text in _beyond(design, name, bounds)]
+    requested = {name: bounds for name, bounds in limits.items() if options.get(name) is not None}
+    if requested:
+        wrong = [text for name, bounds in requested.items() for text in _beyond(design, name, bounds)]
         yield nothing_wrong(
-            "requested bounds", f"what is claimed is within {', '.join(asked)} of the options", wrong, source=_SOURCE
+            "requested bounds",
+            f"what is claimed is within {', '.join(requested)} of the options",
+            wrong,
+            source=_SOURCE,
         )
     wanted = {name: options[name] for name in ("decay", "region", "poles") if name in placed and name in options}
     wanted = {name: value for name, value in wanted.items() if value is not None}

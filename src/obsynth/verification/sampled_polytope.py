@@ -78,12 +78,12 @@ def sampled_polytope(errors: ErrorPolytope, dt: float) -> ErrorPolytope:
 
 @arguments_checked
 def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float:
-    """Return a bound on how far the transition of a sample is off where the parameter moves within it.
+    """Return a bound on the change of a sample's transition matrix when the parameter moves within the sample.
 
     Parameters
     ----------
     errors : ErrorPolytope
-        In continuous time.
+        Of the error system in continuous time.
     dt : float
         Seconds between samples.
     rate : float
@@ -92,7 +92,12 @@ def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float
     Returns
     -------
     float
-        Of ``|Phi - exp(dt A(mu_k))|``, which multiplies the state of the plant.
+        Bound on ``|Phi - exp(dt A(mu_k))|``, Phi the transition of the state over the sample.
+
+    Raises
+    ------
+    SpecError
+        ``dt`` or ``rate`` is not a positive number.
 
     Examples
     --------

@@ -161,14 +161,14 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
 def _per_unit(
     observer: LinearObserver, kind: str, bound: FloatArray, claimed: FloatArray | None, labels: tuple[str, ...]
 ) -> Check:
-    shown = bound[observer.fault_rows] if observer.fault_names else bound
+    outputs = bound[observer.fault_rows] if observer.fault_names else bound
     first = observer.fault_rows.start if observer.fault_names else 0
-    i, j = np.unravel_index(int(np.argmax(shown)), shown.shape)
-    text = f"largest to {observer.row_names[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
+    i, j = np.unravel_index(int(np.argmax(outputs)), outputs.shape)
+    text = f"largest to {observer.row_names[first + int(i)]}: {outputs[i, j]:.2g} per unit of {labels[int(j)]}"
     what = f"error of an estimate per unit of the plant's {kind}, from rounding of the stored numbers"
     name, source = f"stored numbers: {kind}", "the residuals of the identities, outward rounded"
     if claimed is None:
-        row = information(name, what, float(shown[i, j]), source=source, detail=f"{text}; no bound is claimed")
+        row = information(name, what, float(outputs[i, j]), source=source, detail=f"{text}; no bound is claimed")
         return Check(**{**row.__dict__, "status": "proved"})
     if claimed.shape != bound.shape or not np.all(np.isfinite(claimed)):
         return upper_bound_check(name, what, np.nan, 0.0, source=source, detail="the claimed bound has another shape")
@@ -176,14 +176,14 @@ def _per_unit(
     # Where nothing is claimed to be left, nothing may be.
     shares = np.where(allowed > 0.0, bound / np.where(allowed > 0.0, allowed, 1.0), np.inf)
     ratios = np.where(bound > allowed, shares, 0.0)
-    row_found, column = divmod(int(np.argmax(ratios)), ratios.shape[1])
-    if not ratios[row_found, column] > 0.0:
-        row_found, column = first + int(i), int(j)
+    largest_row, column = divmod(int(np.argmax(ratios)), ratios.shape[1])
+    if not ratios[largest_row, column] > 0.0:
+        largest_row, column = first + int(i), int(j)
     return upper_bound_check(
         name,
         f"{what}: at most as claimed",
-        float(bound[row_found, column]),
-        float(allowed[row_found, column]),
+        float(bound[largest_row, column]),
+        float(allowed[largest_row, column]),
         source=source,
         kind="proved",
         detail=text,
@@ -250,7 +250,7 @@ class _Composite:
         self.K, self.J = channel.K.midpoint[:, :width], channel.J.midpoint[rows, :width]
         self.driven = -model.disturbance
         self.direct = observer.Dy[rows] @ plant.Dd
-        self.shown = observer.Cz[rows]
+        self.outputs = observer.Cz[rows]
         values = structure_of(plant).finite_eigenvalues
         self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)
         own = np.abs(poles_of(observer)) if observer.order else np.ones(1)
@@ -313,9 +313,9 @@ class _Composite:
         # From the left, where the rows of fault errors are fewer than the disturbances.
         modal = self._observer_solves
         if modal is None:
-            left = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)]).transpose(0, 2, 1)
+            left = np.concatenate([*resolved(None, self.observer.Az.T, self.outputs.T, points)]).transpose(0, 2, 1)
         else:
-            left = modal.rows(points, self.shown)
+            left = modal.rows(points, self.outputs)
         ages = np.split(left @ self.K + self.J, self.lags, axis=2)
         readings = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
         modal = self._plant_solves

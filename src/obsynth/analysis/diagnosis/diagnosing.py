@@ -38,7 +38,6 @@ from obsynth.plants.transformations.recovery import Transformation
 #: Of more faults the whole bank is refused: 4095 sets are asked about for this many.
 MOST_FAULTS_OF_WHOLE_BANK = 12
 
-
 #: States that could be measured times faults: with more, what would help is not searched here.
 MOST_ADDITIONS = 300
 

@@ -35,7 +35,6 @@ from obsynth.proofs.exact_pencils import ExactPencil
 #: Plants with more unknowns are not reduced exactly, as the numbers grow: their fault polynomials come from pencils.
 MOST_REDUCED = 24
 
-
 #: Plants with more unknowns are decided in floating point.
 MOST_EXACT_UNKNOWNS = 70
 

@@ -26,7 +26,6 @@ SENSOR_SEARCH_UP_TO = 120
 #: Sets of sensors that are listed; the others are counted.
 MOST_LISTED_CHOICES = 6
 
-
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.
 EXACTNESS = 1e-8
 

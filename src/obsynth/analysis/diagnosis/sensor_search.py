@@ -30,7 +30,6 @@ GENERIC_SCALED_POINTS = (0.7391 + 0.2j, 0.31 + 1.3247j)
 #: Part of a fault's column outside the span of the others, relative to it, below which it does not show.
 SHOWN_PART = 1e-9
 
-
 #: Sets of one size are enumerated up to so many; the best of each size are confirmed until so many fail in a row.
 MOST_ENUMERATED_SETS = 40_000
 
@@ -129,7 +128,7 @@ class SensorSearch:
     sensors: tuple[Sensor, ...]
     goal: str
     faults: tuple[int, ...]
-    may_fail: bool  # an added sensor brings a fault of its own, to be told as well
+    may_fail: bool  # an added sensor brings a fault of its own, to be reported as well
     copies: int  # how often a sensor may be taken
 
     @cached_property

@@ -36,10 +36,8 @@ DEPENDENT_SHARE = 0.1
 
 _PENCIL_SEED = 45
 
-
 #: Indexes (``None``: the fault never reaches the outputs) and the rank of Upsilon (0 where one is missing).
 ExactIndexes: TypeAlias = tuple[tuple[int | None, ...], int]
-
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
 WARN_DETECTABILITY_CONDITION = 1e4

@@ -29,7 +29,6 @@ from obsynth.proofs.exact_pencils import ExactPencil
 
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 
-
 _CLAIM = "every mode that does not decay is observable ((A, C) detectable)"
 
 _NEEDED_FOR = "necessary and sufficient with (3); Filasova et al. suppose observability"

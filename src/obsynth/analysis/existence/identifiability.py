@@ -27,7 +27,6 @@ _NAME = "identifiable parameters"
 
 _TRACES_SOURCE = "our finding: (26) needs it, Moussa Ali, Zhang 2013"
 
-
 #: Constant parameters ``(nq,)`` that leave no trace, in their own units, their shares ``(nq,)``, free of units, and the
 #: names of the states that hide them.
 _Kernel: TypeAlias = tuple[FloatArray, FloatArray, tuple[str, ...]]

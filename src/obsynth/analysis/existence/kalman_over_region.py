@@ -57,15 +57,15 @@ def _in_order(plant: PolytopicSystem) -> Iterator[Condition]:
         of_the_method=True,
     )
     yield constant_outputs(plant, "L(mu) C(mu)", _SOURCE)
-    shown = bool(plant.vertices[0].Dd.any())
+    is_measured = bool(plant.vertices[0].Dd.any())
     yield Condition(
         "unknown inputs in outputs",
         "no unknown input shows in an output at once: over a region none is estimated",
-        not shown,
-        float(shown),
+        not is_measured,
+        float(is_measured),
         0.0,
         _SOURCE,
-        "state it as noise (Bw, Dw), or take ui-pi-observer" if shown else "",
+        "state it as noise (Bw, Dw), or take ui-pi-observer" if is_measured else "",
         of_the_method=True,
     )
     rows = free_equations(plant)

@@ -30,7 +30,6 @@ from obsynth.proofs.exact_pencils import ExactPencil, system_pencil
 #: to floating point.
 MOST_EXACT_SIZE = 400
 
-
 #: Plants of more states are decided in floating point.
 EXACT_STATES = 64
 

@@ -39,7 +39,6 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 SOURCE = "Moussa Ali, Zhang 2013"
 
-
 _DETECTABLE = "Nikoukhah, Willsky, Levy 1992"
 
 

@@ -45,10 +45,8 @@ COMPUTED = 1e-12
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
 SCATTER = 1e-2
 
-
 #: Shares that differ by less than this, relative to them, are the same but for rounding.
 SAME_SHARE = 1e-6
-
 
 Decided = TypeVar("Decided")
 

@@ -59,5 +59,4 @@ class DetectionFilter(ObserverDesign):
 # Its parameters are those of every design.
 DetectionFilter.__doc__ = (DetectionFilter.__doc__ or "") + (ObserverDesign.__doc__ or "").partition("\n")[2]
 
-
 detection_filter = design_function(DetectionFilterMethod, DetectionFilter)

@@ -30,7 +30,6 @@ MOST_RATE_STEPS = 12
 #: Steps are shortened down to this factor.
 LEAST_FACTOR = 1.2
 
-
 #: A rate that is asked for is reached by this factor at least, or rounding would decide whether it is.
 WELL_REACHED = 1.001
 

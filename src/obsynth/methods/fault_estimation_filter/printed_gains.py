@@ -30,7 +30,6 @@ NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
 
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
-
 PAPER_WEIGHT, GIVEN_WEIGHT = "gains: paper's W", "gains: given W"
 
 #: W repeats the pseudoinverse to this share of its rows.

@@ -19,8 +19,8 @@ AS_NOTHING = 1e-9
 
 def price_in_words(gamma: float, gains: Mapping[str, FloatArray], observer: LinearObserver) -> str:
     """Return gamma, the norm of W and the H2 norm of the fault estimates from unit noise on each output."""
-    shown, direct = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
-    noise = float(np.sqrt(np.trace(output_covariance(observer.Az, observer.By, shown, direct))))
+    to_faults, direct = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
+    noise = float(np.sqrt(np.trace(output_covariance(observer.Az, observer.By, to_faults, direct))))
     return f"gamma {gamma:.5g}, |W| {np.linalg.norm(gains['W'], 2):.4g}, noise {noise:.4g}"
 
 

@@ -26,7 +26,6 @@ UNREACHED_STATE = 1e-4
 
 _SOURCE = "Wang 2015, eqs. (32), (44)"
 
-
 #: The observer's matrices.
 OBSERVER_MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
 

@@ -30,13 +30,11 @@ from obsynth.verification.plant import condition_rows, plant_information
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_LEVEL = 1e-7
 
-
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
 TRACKING_TOLERANCE = 1e-8
 
 #: Claimed deviations may be missed by this share: two ways through a Lyapunov equation.
 DEVIATION_TOLERANCE = 1e-4
-
 
 _FUNCTIONAL_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
 

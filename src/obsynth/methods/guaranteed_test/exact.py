@@ -1,8 +1,8 @@
-"""What the very samples of a window tell: the least interval of the fault, or the least test without missing samples.
+"""The least interval of the fault that the samples of a window allow, and the least test where samples are missing.
 
 Both are linear programmes, solved by HiGHS from the basis of the window without data, so that a row is the same
-wherever a run begins.  Only what is then proved of their multipliers counts: whatever multipliers see the fault with
-weight one and nothing free, it lies within ``T(mu)`` of ``mu' b``.
+wherever a run begins.  Only what is then proved of their multipliers counts: with multipliers mu that give the fault
+weight one and every free signal weight zero, the fault lies within ``T(mu)`` of ``mu' b``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KEPT_PATTERNS = 256
 #: Where nothing satisfies a window to the tightest tolerance it is tried with this one: only proofs count.
 LOOSE = 1e-7
 
-#: A ray that refutes a window is added so many times to a test, which it moves as far as one likes.
+#: A ray that refutes a window is added so many times to a test: it moves the test without bound.
 TIMES_OF_A_RAY = 1e3
 
 
@@ -64,7 +64,7 @@ class Programmes:
         return cls(window, rows_before(design) + 1 - window.question.samples)
 
     def __reduce__(self) -> Any:
-        # HiGHS stays where it is: programmes are made again.
+        # HiGHS cannot be pickled: programmes are made again.
         return Programmes, (self.window, self.delay)
 
     def _programme(self, y: FloatArray, u: FloatArray) -> tuple[_Programme, FloatArray, FloatArray]:

@@ -25,10 +25,8 @@ SOURCE = "duality of linear programmes"
 #: Values of a hidden course below this share of its largest are not told.
 TOLD_COURSE = 1e-6
 
-
 #: What least squares may leave of an equation, as a share of the fault's own weight.
 SEEN = 1e-6
-
 
 #: More states than these are not listed.
 MOST_NAMED_STATES = 8
@@ -77,7 +75,7 @@ def conditions(
     )
     if not all(condition.holds for condition in first) or not with_windows:
         return first
-    # Of a bank: that a fault is told where no other is there; some group then tells it.
+    # Of a bank: that a fault is reported where no other is there; some group then shows it.
     alone = [replace(options, isolate=False, fault=name, free="none") for name in names]
     each = alone if options.isolate and isinstance(plant, DescriptorSystem) else [options]
     return (*first, *(detectability(problem_of(plant, own), own)[0] for own in each))

@@ -65,17 +65,14 @@ COLUMN_ROOM = 1.0 + 1e-9
 #: The table of samples against threshold in a certificate.
 TRADE_OFF = "trade_off"
 
-
 #: The method whose observer runs beside a test: faults do not move its state estimate.
 BESIDE = "fault-estimation-filter"
 
 #: Samples of the scenario over which thresholds are compared, at most.
 MOST_COMPARED_SAMPLES = 500
 
-
 #: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
 MEASURED_EQUATIONS, MEASURED_SECONDS, TIME_GROWTH = 1800, 2.3, 2.3
-
 
 #: Seconds below which no number is given, and from which on minutes are.
 SHORT_SECONDS, MINUTES = 5.0, 120.0

@@ -34,7 +34,6 @@ SETTLING_SHARE = 0.2
 #: otherwise there, and each way is a bound (0.5 % on the drive).
 MEAN_ROOM = 2e-2
 
-
 #: Courses of disturbances that do not change between samples.
 HELD_BETWEEN_SAMPLES = ("jump", "held")
 

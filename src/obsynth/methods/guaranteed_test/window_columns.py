@@ -1,4 +1,4 @@
-"""The columns of a window: how they are collected, and those of disturbances and of the fault."""
+"""The columns of a window's linear programme: disturbances at and between the samples, and the fault."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from obsynth.numerics.arrays import FloatArray
 
 
 class Builder:
-    """Collects columns and entries."""
+    """Collects the columns of a sparse matrix, their bounds, and its entries."""
 
     def __init__(self) -> None:
+        #: By column: kind, sample and number of its signal.
         self.labels: list[tuple[Any, ...]] = []
+        #: By column: the largest absolute value.
         self.bar: list[float] = []
+        #: By column: the number of its ellipsoid, -1 without.
         self.group: list[int] = []
+        #: By block: rows, columns and values of its entries, and the whole number by which each is multiplied.
         self.parts: list[tuple[np.ndarray, np.ndarray, FloatArray, np.ndarray]] = []
 
     def columns(self, labels: list[tuple[Any, ...]], bars: Any, group: int = -1) -> int:
-        """Append columns; return the number of the first."""
+        """Append columns with their bounds ``bars``; return the number of the first."""
         first = len(self.labels)
         self.labels += labels
         self.bar += [float(value) for value in bars]
@@ -28,7 +32,7 @@ class Builder:
         return first
 
     def put(self, row: int, matrix: FloatArray, column: int, times: int = 1) -> None:
-        """Enter a block of the matrix."""
+        """Enter ``times`` a block of the matrix, its upper left entry at ``(row, column)``."""
         i, j = np.nonzero(matrix)
         if i.size and times:
             self.parts.append((row + i, column + j, matrix[i, j], np.full(i.size, times, dtype=np.int64)))
@@ -37,7 +41,8 @@ class Builder:
 def disturbance_columns(
     bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int
 ) -> int:
-    """Enter the disturbances; return the number of rows."""
+    """Enter the disturbances over ``span``, and with a bounded rate one more row for each change; return how many rows
+    there are then."""
     entry = np.ones((1, 1))
     kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
     for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
@@ -92,7 +97,7 @@ def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], Float
 
 
 def fault_columns(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
-    """Enter the fault that is looked for."""
+    """Enter the fault: its size at the target sample is column 0, others hold what its course leaves free."""
     fault = np.array([question.fault])
     target = question.samples - 1 - question.lag
     if question.course in ("constant", "step"):

@@ -337,7 +337,7 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
             own[label[1] :] += value if label[1] > target else 0.0
             own[: label[1]] -= value if label[1] <= target else 0.0
     if question.course == "any":
-        # Column 0 is the sample that is told, the others have columns of their own.
+        # Column 0 is the sample that is reported, the others have columns of their own.
         target = question.samples - 1 - question.lag
         own[np.arange(length) == target] = point[0]
         own_samples = {label[1] for label in window.labels if label[0] == "f" and label[2] == question.fault}

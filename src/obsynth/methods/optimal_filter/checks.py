@@ -164,10 +164,10 @@ def _options_fit(design: ObserverDesign) -> bool:
         timed = timed and claims.get("delay") == max(late, default=None) and options["reference"] is None
         timed = timed and plant.is_discrete and options["exact"] is True
     else:
-        given = options["reference"]
-        same = isinstance(given, Mapping) and all(
-            np.array_equal(np.reshape(given.get(name, ()), np.shape(part)), part)
-            if np.size(given.get(name, ())) == np.size(part)
+        stated = options["reference"]
+        same = isinstance(stated, Mapping) and all(
+            np.array_equal(np.reshape(stated.get(name, ()), np.shape(part)), part)
+            if np.size(stated.get(name, ())) == np.size(part)
             else False
             for name, part in zip("ABCD", reference, strict=True)
         )

@@ -21,19 +21,19 @@ def is_auto(delay: Any) -> bool:
     return isinstance(delay, str)
 
 
-def delays_of(given: Any, plant: DescriptorSystem) -> tuple[int | None, ...]:
+def delays_of(delays: Any, plant: DescriptorSystem) -> tuple[int | None, ...]:
     """Return the delay of each fault, ``None`` where it is to be chosen; raise `SpecError` for what fits no fault."""
-    if isinstance(given, Mapping):
-        require_known(given, plant.fault_names, what=PATH, kind="fault")
-        left = [name for name in plant.fault_names if name not in given]
-        if left:
-            raise SpecError(f"delay has no entry for {', '.join(left)}: give samples or 'auto' for each.", path=PATH)
-        given = [given[name] for name in plant.fault_names]
-    if is_auto(given) or not isinstance(given, (Sequence, np.ndarray)):
-        given = [given] * plant.nf
-    if len(given) != plant.nf:
-        raise SpecError(f"delay has {len(given)} entries; the plant has {plant.nf} faults.", path=PATH)
-    return tuple(None if isinstance(one, str) else int(one) for one in given)
+    if isinstance(delays, Mapping):
+        require_known(delays, plant.fault_names, what=PATH, kind="fault")
+        missing = [name for name in plant.fault_names if name not in delays]
+        if missing:
+            raise SpecError(f"delay has no entry for {', '.join(missing)}: give samples or 'auto' for each.", path=PATH)
+        delays = [delays[name] for name in plant.fault_names]
+    if is_auto(delays) or not isinstance(delays, (Sequence, np.ndarray)):
+        delays = [delays] * plant.nf
+    if len(delays) != plant.nf:
+        raise SpecError(f"delay has {len(delays)} entries; the plant has {plant.nf} faults.", path=PATH)
+    return tuple(None if isinstance(one, str) else int(one) for one in delays)
 
 
 def plain_delays(delays: tuple[int, ...]) -> int | list[int]:

@@ -129,9 +129,9 @@ class Designed(NamedTuple):
         return self.gain <= self.nothing
 
 
-def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]:
+def conditions(plant: DescriptorSystem, options: Options) -> tuple[Condition, ...]:
     """Return whether the pencil is regular, whether there are faults, and whether a stable filter has a fault map."""
-    plant = seen_plant(plant.dense(), asked.decoupled_names(plant))
+    plant = seen_plant(plant.dense(), options.decoupled_names(plant))
     regular, rank = regularity_of(plant)
     claim = "the equations determine the states: det(z E - A) is not zero everywhere"
     first = Condition("regularity", claim, regular, rank, plant.nx, _SOURCE)
@@ -143,27 +143,27 @@ def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]
         )
     claim = "a stable causal filter has this fault map, whatever known and decoupled inputs do"
     try:
-        first_problem_or_driven(plant, asked)
+        first_problem_or_driven(plant, options)
     except PreconditionError as error:
         return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error))
     return first, Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
 
 
-def first_problem_or_driven(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:
+def first_problem_or_driven(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, EstimationProblem]:
     """Return `first_problem` of the plant, or where it has none of the one whose lasting modes are driven."""
     try:
-        return first_problem(plant, asked)
+        return first_problem(plant, options)
     except PreconditionError:
         driven = with_lasting_modes_driven(plant)
         if driven is plant:
             raise
-        return first_problem(driven, asked)
+        return first_problem(driven, options)
 
 
-def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:
+def first_problem(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, EstimationProblem]:
     """Return the first fault map that exists, of those that the options leave open, with its problem."""
     last = PreconditionError("No fault map is left open by the options.", condition="fault map")
-    for fault_map in _open_maps(plant, asked):
+    for fault_map in _open_maps(plant, options):
         try:
             problem = problem_of(plant, fault_map)
             require_stable_filter(problem)
@@ -177,17 +177,17 @@ def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, Es
     raise last
 
 
-def _open_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
-    for fault_map in _unweighted_maps(plant, asked):
+def _open_maps(plant: DescriptorSystem, options: Options) -> Iterator[FaultMap]:
+    for fault_map in _unweighted_maps(plant, options):
         rows = plant.nf if fault_map.reference is None else len(fault_map.reference[2])
-        yield fault_map._replace(weights=weights_of(asked.weights, plant, rows=rows, exact=fault_map.exact))
+        yield fault_map._replace(weights=weights_of(options.weights, plant, rows=rows, exact=fault_map.exact))
 
 
-def _unweighted_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
-    if asked.reference is not None:
-        yield FaultMap(None, reference_model(asked.reference, plant), asked.exact)
+def _unweighted_maps(plant: DescriptorSystem, options: Options) -> Iterator[FaultMap]:
+    if options.reference is not None:
+        yield FaultMap(None, reference_model(options.reference, plant), options.exact)
     elif plant.is_discrete:
-        delays = delays_of(asked.delay, plant)
+        delays = delays_of(options.delay, plant)
         tried = range(plant.nx + 2 if None in delays else 1)
         yield from (FaultMap(tuple(late if one is None else one for one in delays), None, True) for late in tried)
     else:
@@ -233,21 +233,21 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
 def channels_of(plant: DescriptorSystem, fault_map: FaultMap) -> tuple[Channels, FloatArray]:
     """Return a plant in units in which it is near one, and the unit of each fault."""
     own, units = _units_of(plant)
-    left, shown, states = own.equations[:, None], own.outputs[:, None], own.states
+    equations, outputs, states = own.equations[:, None], own.outputs[:, None], own.states
     each = own.faults if fault_map.exact else np.full(plant.nf, units.error)
     noise = units.noise if fault_map.exact else units.error
     channels = Channels(
-        left * plant.E * states,
-        left * plant.A * states,
-        shown * plant.C * states,
-        left * plant.B,
-        shown * plant.D,
-        left * plant.Bf * each,
-        shown * plant.Df * each,
-        left * plant.Bd * own.disturbances,
-        shown * plant.Dd * own.disturbances,
-        left * plant.Bw * noise,
-        shown * plant.Dw * noise,
+        equations * plant.E * states,
+        equations * plant.A * states,
+        outputs * plant.C * states,
+        equations * plant.B,
+        outputs * plant.D,
+        equations * plant.Bf * each,
+        outputs * plant.Df * each,
+        equations * plant.Bd * own.disturbances,
+        outputs * plant.Dd * own.disturbances,
+        equations * plant.Bw * noise,
+        outputs * plant.Dw * noise,
         plant.dt,
     )
     return channels, each

@@ -92,8 +92,8 @@ def _without_rounding(filter_: Model) -> Model:
     """Return a filter without entries of B and C that are nothing beside what passes at once."""
     a, b, c, d = filter_
     size = ROUNDING_SHARE * float(np.linalg.norm(d))
-    entering, shown = float(np.linalg.norm(b)), float(np.linalg.norm(c))
-    return a, np.where(np.abs(b) * shown > size, b, 0.0), np.where(np.abs(c) * entering > size, c, 0.0), d
+    input_size, output_size = float(np.linalg.norm(b)), float(np.linalg.norm(c))
+    return a, np.where(np.abs(b) * output_size > size, b, 0.0), np.where(np.abs(c) * input_size > size, c, 0.0), d
 
 
 def _balanced(filter_: Model) -> Model:
@@ -152,18 +152,18 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
 
 
 def observer_of(
-    plant: DescriptorSystem, found: Followed, names: tuple[str, ...], delays: tuple[int, ...]
+    plant: DescriptorSystem, error_system: Followed, names: tuple[str, ...], delays: tuple[int, ...]
 ) -> LinearObserver:
     """Return the observer; known inputs enter it as they do the plant."""
-    t, t0 = found.T[:, : plant.nx], found.T0[:, : plant.nx]
+    t, t0 = error_system.T[:, : plant.nx], error_system.T0[:, : plant.nx]
     named = names == plant.fault_names
     return LinearObserver(
-        Az=found.A,
-        Bu=t @ plant.B - found.B @ plant.D,
-        By=found.B,
-        Cz=found.C,
-        Du=t0 @ plant.B - found.D @ plant.D,
-        Dy=found.D,
+        Az=error_system.A,
+        Bu=t @ plant.B - error_system.B @ plant.D,
+        By=error_system.B,
+        Cz=error_system.C,
+        Du=t0 @ plant.B - error_system.D @ plant.D,
+        Dy=error_system.D,
         dt=plant.dt,
         input_names=plant.input_names,
         output_names=plant.output_names,
@@ -187,8 +187,8 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
         return np.asarray(finite & ((np.abs(ratio) < 1.0) if plant.is_discrete else (ratio.real < 0.0)))
 
     units = PlantUnits.of(plant).rounded()
-    left, states = units.equations[:, None], units.states
-    own_a, own_e = left * plant.A * states, left * plant.E * states
+    equations, states = units.equations[:, None], units.states
+    own_a, own_e = equations * plant.A * states, equations * plant.E * states
     a, e, alpha, beta, _, right = scipy.linalg.ordqz(own_a.T, own_e.T, sort=dies, output="real")
     count = int(np.sum(dies(alpha, beta)))
     moved = np.linalg.solve(e[:count, :count], a[:count, :count]).T if count else np.zeros((0, 0))
@@ -206,7 +206,7 @@ def _followed(
     """Return a filter beside copies ``copied`` of modes, with T and T0, and the share of `IDENTITIES_LEFT` to which
     every equation holds; ``None`` where one misses all of them."""
     a, b, c, d = filter_
-    e, own, _, seen = with_past(plant, lag)
+    e, own, _, dd_past = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
     bd = np.vstack([plant.Bd, np.zeros((na - plant.nx, plant.nd))])
     left = _left_kernel(e)
@@ -229,14 +229,14 @@ def _followed(
             equations(None, None, np.kron(outputs, (left @ bd).T), None),
         ]
     )
-    products = ((-b, seen), (b, plant.Dd), (-d, seen), (d, plant.Dd))
+    products = ((-b, dd_past), (b, plant.Dd), (-d, dd_past), (d, plant.Dd))
     wanted = np.concatenate([(one @ other).ravel() for one, other in products])
     terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
     heights = nz * na, nz * plant.nd, rows * na
     solution, share = _cleaned_solution(system, (wanted, terms_wanted), heights, na, plant.nd)
     if solution is None:
         return None, share
-    t, into, s, shown = (
+    t, into, s, c_past = (
         part.reshape(shape)
         for part, shape in zip(
             np.split(solution, np.cumsum(sizes)[:-1]),
@@ -245,13 +245,13 @@ def _followed(
         )
     )
     # Only the copies that are read.
-    basis = reachable_basis(moved.T, np.vstack([into, shown]).T) if count else np.zeros((0, 0))
-    into, shown, moved = into @ basis, shown @ basis, basis.T @ moved @ basis
+    basis = reachable_basis(moved.T, np.vstack([into, c_past]).T) if count else np.zeros((0, 0))
+    into, c_past, moved = into @ basis, c_past @ basis, basis.T @ moved @ basis
     copies, copy_count = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
     follower = Followed(
         np.block([[a, into], [np.zeros((copy_count, nz)), moved]]),
         np.vstack([b, np.zeros((copy_count, plant.ny))]),
-        np.hstack([c, shown]),
+        np.hstack([c, c_past]),
         d,
         np.vstack([t, copies]),
         s @ left,
@@ -295,7 +295,7 @@ def _solved(system: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatAr
 
 def _holds(
     system: FloatArray,
-    found: FloatArray,
+    solution: FloatArray,
     wanted: tuple[FloatArray, FloatArray],
     heights: tuple[int, ...],
     width: int,
@@ -305,7 +305,7 @@ def _holds(
 
     ``wanted``: the right sides, and the sizes of what cancels in them.
     """
-    missed, terms = np.abs(system @ found - wanted[0]), np.abs(system) @ np.abs(found) + wanted[1]
+    missed, terms = np.abs(system @ solution - wanted[0]), np.abs(system) @ np.abs(solution) + wanted[1]
     ends = np.cumsum(heights)
     for part, height in ((slice(0, ends[0]), heights[0]), (slice(ends[1], ends[2]), heights[2])):
         if height:
@@ -318,19 +318,19 @@ def _holds(
 
 def _shows_a_disturbance(
     system: FloatArray,
-    found: FloatArray,
+    solution: FloatArray,
     wanted: tuple[FloatArray, FloatArray],
     heights: tuple[int, ...],
     disturbances: int,
 ) -> bool:
     """Whether more is left of some decoupled disturbance than a share of what cancels."""
-    missed, terms = np.abs(system @ found - wanted[0]), np.abs(system) @ np.abs(found) + wanted[1]
+    missed, terms = np.abs(system @ solution - wanted[0]), np.abs(system) @ np.abs(solution) + wanted[1]
     ends = np.cumsum(heights)
     own = np.r_[ends[0] : ends[1], ends[2] : len(missed)]
     if not disturbances or not len(own):
         return False
-    left, size = (np.max(part[own].reshape(-1, disturbances), axis=0) for part in (missed, terms))
-    return bool(np.any(left > DISTURBANCE_LEFT * size))
+    largest, size = (np.max(part[own].reshape(-1, disturbances), axis=0) for part in (missed, terms))
+    return bool(np.any(largest > DISTURBANCE_LEFT * size))
 
 
 def _left_kernel(e: FloatArray) -> FloatArray:

@@ -18,24 +18,24 @@ from obsynth.plants.descriptor import DescriptorSystem
 PATH = f"{OPTIONS_PATH}.reference"
 
 
-def reference_model(given: Any, plant: DescriptorSystem) -> Model:
+def reference_model(reference: Any, plant: DescriptorSystem) -> Model:
     """Return ``(A, B, C, D)`` of a reference model with ``nf`` inputs; raise `SpecError` for what is none."""
-    if isinstance(given, Mapping) and "bandwidth" in given:
-        order, width = given.get("order", 1), given["bandwidth"]
-        fits = set(given) <= {"bandwidth", "order"} and is_whole(order) and order >= 1 and is_finite_number(width)
+    if isinstance(reference, Mapping) and "bandwidth" in reference:
+        order, width = reference.get("order", 1), reference["bandwidth"]
+        fits = set(reference) <= {"bandwidth", "order"} and is_whole(order) and order >= 1 and is_finite_number(width)
         if not fits or not width > 0:
             raise SpecError("A lag is {'bandwidth': rad/s, 'order': 1}, both positive.", path=PATH)
         return lag_model(float(width), int(order), plant.nf, plant.dt)
-    model = model_of(given, plant, "reference model", PATH)
+    model = model_of(reference, plant, "reference model", PATH)
     inputs = model[3].shape[1]
     if inputs != plant.nf:
         raise SpecError(f"The reference model has {inputs} inputs; the plant has {plant.nf} faults.", path=PATH)
     return model
 
 
-def model_of(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
+def model_of(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
     """Return ``(A, B, C, D)`` of a stable model in the time of a plant; raise `SpecError`, which says what it is."""
-    a, b, c, d = _matrices(given, plant, what, path)
+    a, b, c, d = _matrices(model, plant, what, path)
     modes = np.linalg.eigvals(a) if len(a) else np.zeros(0)
     if np.any(np.abs(modes) >= 1.0) if plant.is_discrete else np.any(modes.real >= 0.0):
         raise SpecError(f"The {what} is not stable: no stable filter follows it.", path=path)
@@ -57,16 +57,16 @@ def plain(model: Model) -> dict[str, Any]:
     return {name: part.tolist() for name, part in zip("ABCD", model, strict=True)}
 
 
-def _matrices(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
-    if isinstance(given, Mapping):
-        if set(given) - set("ABCD") or "D" not in given:
+def _matrices(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
+    if isinstance(model, Mapping):
+        if set(model) - set("ABCD") or "D" not in model:
             lag = "is {'bandwidth': 10}, or " if path == PATH else ""
             raise SpecError(f"A {what} {lag}has matrices A, B, C and D.", path=path)
-        parts = [given.get(name, ()) for name in "ABCD"]
-    elif isinstance(given, Sequence) and not isinstance(given, str) and len(given) == 4:
-        parts = [*given]
-    elif hasattr(given, "dt"):
-        return _of_control(given, plant, what, path)
+        parts = [model.get(name, ()) for name in "ABCD"]
+    elif isinstance(model, Sequence) and not isinstance(model, str) and len(model) == 4:
+        parts = [*model]
+    elif hasattr(model, "dt"):
+        return _of_control(model, plant, what, path)
     else:
         lag = "{'bandwidth': 10}" if path == PATH else "a number"
         raise SpecError(f"A {what} is {lag}, matrices (A, B, C, D), or a system of python-control.", path=path)
@@ -88,12 +88,12 @@ def _shaped(parts: Sequence[Any], what: str, path: str) -> Model:
     return matrices[0], matrices[1], matrices[2], d
 
 
-def _of_control(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
+def _of_control(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
     """Return the matrices of a system of python-control; raise `SpecError` for an improper or wrongly timed one."""
     import control
 
     try:
-        system = control.ss(given)
+        system = control.ss(model)
     except (ValueError, TypeError, AttributeError, ImportError) as error:
         raise SpecError(f"The {what} has no proper state space: {error}.", path=path) from None
     if bool(system.dt) != plant.is_discrete or (plant.is_discrete and system.dt not in (True, plant.dt)):

@@ -40,25 +40,25 @@ class Weights(NamedTuple):
         return sum(len(model[0]) for model in self if model is not None)
 
 
-def weights_of(given: Any, plant: DescriptorSystem, *, rows: int, exact: bool) -> Weights | None:
+def weights_of(option: Any, plant: DescriptorSystem, *, rows: int, exact: bool) -> Weights | None:
     """Return the weights of a plant whose bounded disturbances count as noise; ``None`` where nothing is weighted.
 
     ``rows``: of the estimate.  Raise `SpecError` for signals that have none, and for models that are no weights.
     """
-    if given is None:
+    if option is None:
         return None
-    if not isinstance(given, Mapping) or not set(given) <= {ERRORS, INPUTS}:
+    if not isinstance(option, Mapping) or not set(option) <= {ERRORS, INPUTS}:
         raise SpecError(
             "weights are {'errors': {'fault': weight}, 'inputs': {'noise': weight}}, each a number or a stable model "
             "of one input and one output, such as control.tf([1, 1], [1, 0.1]).",
             path=PATH,
         )
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-    errors = _by_name(given.get(ERRORS), names, plant, ERRORS)
+    errors = _by_name(option.get(ERRORS), names, plant, ERRORS)
     for name, model in errors.items():
         _require_inverse(model, plant, f"{ERRORS}.{name}")
     faults = () if exact else plant.fault_names
-    inputs = _by_name(given.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
+    inputs = _by_name(option.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
     weights = Weights(
         _diagonal(errors, names),
         _diagonal(inputs, plant.noise_names),
@@ -67,11 +67,11 @@ def weights_of(given: Any, plant: DescriptorSystem, *, rows: int, exact: bool) -
     return None if weights == (None, None, None) else weights
 
 
-def plain_weights(given: Any, plant: DescriptorSystem) -> Any:
+def plain_weights(option: Any, plant: DescriptorSystem) -> Any:
     """Return the weights as an option: numbers, and matrices of models by name."""
-    if given is None:
+    if option is None:
         return None
-    groups = {ERRORS: given.get(ERRORS), INPUTS: given.get(INPUTS)}
+    groups = {ERRORS: option.get(ERRORS), INPUTS: option.get(INPUTS)}
     weights_by_group: dict[str, Any] = {}
     for group, entry in groups.items():
         if isinstance(entry, Mapping) and not _is_model(entry):
@@ -108,25 +108,25 @@ def _plain(entry: Any, plant: DescriptorSystem, name: str) -> Any:
     return float(entry) if is_finite_number(entry) else plain(_weight(entry, plant, name))
 
 
-def _by_name(given: Any, names: tuple[str, ...], plant: DescriptorSystem, group: str) -> dict[str, Model]:
+def _by_name(entries: Any, names: tuple[str, ...], plant: DescriptorSystem, group: str) -> dict[str, Model]:
     """Return the weights of named signals; one that is not by name is that of all of them."""
-    if given is None:
+    if entries is None:
         return {}
-    if isinstance(given, Mapping) and not _is_model(given):
-        require_known(given, names, what=f"{PATH}.{group}", kind="signal")
-        return {name: _weight(given[name], plant, f"{group}.{name}") for name in names if name in given}
-    weight = _weight(given, plant, group)
+    if isinstance(entries, Mapping) and not _is_model(entries):
+        require_known(entries, names, what=f"{PATH}.{group}", kind="signal")
+        return {name: _weight(entries[name], plant, f"{group}.{name}") for name in names if name in entries}
+    weight = _weight(entries, plant, group)
     return dict.fromkeys(names, weight)
 
 
-def _weight(given: Any, plant: DescriptorSystem, name: str) -> Model:
+def _weight(value: Any, plant: DescriptorSystem, name: str) -> Model:
     path = f"{PATH}.{name}"
-    if is_finite_number(given):
-        if given == 0:
+    if is_finite_number(value):
+        if value == 0:
             raise SpecError(f"The weight of {name} is zero: leave the signal out of the plant instead.", path=path)
         none = np.zeros((0, 0))
-        return none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[float(given)]])
-    model = model_of(given, plant, "weight", path)
+        return none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[float(value)]])
+    model = model_of(value, plant, "weight", path)
     if model[3].shape != (1, 1):
         raise SpecError(
             f"The weight of {name} has {model[3].shape[1]} inputs and {model[3].shape[0]} outputs: give one of each.",

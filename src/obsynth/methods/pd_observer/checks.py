@@ -47,7 +47,6 @@ _PD_IDENTITIES = {
     ),
 }
 
-
 #: Norms of ``[J L]`` above this many times the norm of A are out of proportion to the plant, and worth a warning.
 LARGE_GAIN = 1e2
 

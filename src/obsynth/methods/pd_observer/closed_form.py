@@ -32,7 +32,6 @@ SCHUR_METHOD_UP_TO = 60
 #: With more still the QZ algorithm is not tried, which is the last way: .7 s at 200 states, growing with their cube.
 QZ_METHOD_UP_TO = 200
 
-
 _WHAT = "a PD observer with L = 0"
 
 

@@ -59,7 +59,6 @@ HIDDEN_SHARE = 0.5
 #: Decay rates within this factor count as equal where outputs are merged or not.
 AS_FAST = 1.001
 
-
 _CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.conditions.augmented_plant import combinations_seen, realise, with_faults
+from obsynth.conditions.augmented_plant import measured_combinations, realise, with_faults
 from obsynth.methods.method import Synthesis, plain
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
@@ -61,7 +61,7 @@ def assembled(
     structured: bool,
 ) -> Synthesis:
     """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
-    observer, letters = realise(plant, model, gains, combinations_seen(plant))
+    observer, letters = realise(plant, model, gains, measured_combinations(plant))
     nx, (u, d, k) = plant.nx, gains
     if structured:
         letters |= {"U": u[:nx, :nx], "D": d[:nx], "K": k[:nx], "F": k[nx:]}

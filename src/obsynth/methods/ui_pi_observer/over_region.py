@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_over_region
-from obsynth.conditions.augmented_plant import combinations_seen, realise
+from obsynth.conditions.augmented_plant import measured_combinations, realise
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_free_gains, pi_over_region
 from obsynth.errors import SolverError, SpecError
@@ -135,7 +135,7 @@ def _synthesis(
     rate: float | None = None,
 ) -> Synthesis:
     U_a, D_a, K_a = parts.letters(certificate.gains)
-    combinations = combinations_seen(plant.center)
+    combinations = measured_combinations(plant.center)
     made = [
         realise(vertex, model, (U_a, D_a, K), combinations)[0] for vertex, K in zip(plant.vertices, K_a, strict=True)
     ]

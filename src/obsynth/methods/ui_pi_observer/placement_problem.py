@@ -33,7 +33,6 @@ INTEGRATOR_SCATTER = 3e-5
 #: be distinguished, and printed gains miss them.
 MOST_PER_SAMPLE = 2.0
 
-
 #: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
 PROCESS_SHARE = 0.1
 

@@ -48,13 +48,10 @@ FAR_SLOWER = 3.0
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0
 
-
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5
 
-
 Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
-
 
 #: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0

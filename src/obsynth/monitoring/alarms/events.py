@@ -56,7 +56,6 @@ REASONS = {
     NO_DECISION: "the window of the monitor was not full, or a warm-up or a gap was not over",
 }
 
-
 #: Alarms that a summary lists.
 MOST_LISTED_ALARMS = 20
 
@@ -171,7 +170,7 @@ class AlarmLog:
         named = "" if before is None else before.fault
         tells = before is None or (distinguished and not evidence <= self._named_by[by])
         shelved = self._shelved(by, fault, time)
-        # What explains an alarm that was shelved is told, whatever it was called at larger evidence.
+        # What explains an alarm that was shelved is reported, whatever it was called at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
         size, low, high = self._size(fault, cells, ranking) if tells else earlier

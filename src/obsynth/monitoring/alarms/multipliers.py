@@ -129,7 +129,7 @@ def _listed(
 def _bound_text(name: str, size: float, middle: float, unit: str, word: str) -> str:
     noise = word == "noise of"
     if middle:
-        # Ends are told as they were given, which half width and middle are to some digits.
+        # Ends are reported as they were given, which half width and middle are to some digits.
         low, high = (float(f"{end:.12g}") for end in (middle - size, middle + size))
         within = f"{shown(low)} to {shown(high, unit)}"
     else:

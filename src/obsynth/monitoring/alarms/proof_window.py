@@ -36,7 +36,6 @@ LARGEST_RELAXATION = 1e3
 #: Bounds of the state are widened by this share: more than rounding can take from them.
 WINDOW_OUTWARD = 1e-9
 
-
 #: Where the bounds of the state come from.
 REPLAY, STATED_BOUNDS = "replay from the start", "stated"
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out, wrong_samples
+from obsynth.monitoring.calibration.diagnostics import OUTLYING, standing_out, wrong_samples
 from obsynth.monitoring.calibration.innovations_fit import (
     InnovationsFit,
     box_beside,
@@ -20,10 +20,10 @@ from obsynth.monitoring.calibration.innovations_fit import (
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.likelihood import Likelihood
 from obsynth.monitoring.calibration.linear_plant import LinearPlant
-from obsynth.monitoring.calibration.logs import LogData, RecordedLog, read_log, told_rows
+from obsynth.monitoring.calibration.logs import LogData, RecordedLog, listed_rows, read_log
 from obsynth.monitoring.calibration.long_logs import is_long, searched_rows
 from obsynth.monitoring.calibration.noise_proposals import like_problem, proposed_states
-from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states
+from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, stated_noise_states
 from obsynth.monitoring.calibration.plants import CalibrationPlant, NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem, calibration_problem, require_variation
 from obsynth.monitoring.calibration.reporting import reported
@@ -33,7 +33,7 @@ from obsynth.monitoring.calibration.simulation_error import (
     Fit,
     SimulationError,
     simulation_fits,
-    with_seen_start,
+    with_observed_start,
 )
 from obsynth.monitoring.calibration.wrong_runs import wrong_runs
 from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_number
@@ -230,7 +230,7 @@ def calibrate(
     )
     record = _usable(read, input_delay)
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, record)
-    noise_model = asked_states(sensor_noise, offset, walks, model.output_names)
+    noise_model = stated_noise_states(sensor_noise, offset, walks, model.output_names)
 
     def problem_with(states: NoiseStates, log: RecordedLog) -> CalibrationProblem:
         extended = PlantWithNoise(plant, states, log) if states else plant
@@ -256,20 +256,13 @@ def calibrate(
     fitting = _Fitting(
         plant, problem_with, starts, seed, level, note, integration == "auto", initial_covariance is None, innovations
     )
-    search = innovations and input_delay == "auto" and bool(model.input_names)
-    part = searched_rows(record) if innovations else record
-    fitted, noise_model, sentences = fitting.first_fit(
-        noise_model, part, search=search, may_take_offsets=offset is None
-    )
-    fitted = fitting.without_outliers(fitted)
     kinds = (("coloured", sensor_noise), ("offset", offset), ("walk", walks))
-    open_kinds = tuple(kind for kind, stated in kinds if stated is None)
-    if fitted.fit is not None and open_kinds:
-        fitted = fitting.with_proposals(fitted, fitted.fit, noise_model, open_kinds, sentences)
-    if part is not record and fitted.fit is not None:
-        fitted = fitting.on_whole(fitted, fitted.fit, record)
-    if offset is None:
-        fitted = fitting.with_unseen_offsets(fitted)
+    fitted = fitting.in_stages(
+        noise_model,
+        record,
+        search=innovations and input_delay == "auto" and bool(model.input_names),
+        open_kinds=tuple(kind for kind, stated in kinds if stated is None),
+    )
     return reported(
         fitted.problem,
         fitted.fits[0],
@@ -346,7 +339,7 @@ class _Fitting:
     def fitted(self, problem: CalibrationProblem, *, search: bool) -> _FittedProblem:
         """Return the fit of a problem; the delay of the inputs is searched for where asked."""
         fits = simulation_fits(problem, self.starts, self.seed, self.note)
-        if self.widen_start and (widened := with_seen_start(problem, fits[0])) is not problem:
+        if self.widen_start and (widened := with_observed_start(problem, fits[0])) is not problem:
             problem, fits = widened, simulation_fits(widened, 1, self.seed, self.note, start=fits[0].t)
         error = None
         if self.choose_steps and isinstance(self.plant, NonlinearPlant):
@@ -368,11 +361,27 @@ class _Fitting:
             before = problem, error
             problem, fit, error = _innovations(problem, fits, self.level, self.note, error)
             if self.widen_start and fit is not None:
-                widened = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
+                widened = with_observed_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
                 if widened is not before[0]:
                     fits = simulation_fits(widened, 1, self.seed, self.note, start=fits[0].t)
                     problem, fit, error = _innovations(widened, fits, self.level, self.note, before[1])
         return _FittedProblem(problem, fits, fit, error, losses)
+
+    def in_stages(
+        self, noise_model: NoiseStates, record: RecordedLog, *, search: bool, open_kinds: tuple[str, ...]
+    ) -> _FittedProblem:
+        """Return the fit of a log: on part of its rows, without outliers, with noise of the kinds that are not stated,
+        on all rows, and beside offsets that are too small to be estimated.  ``search``: for the delay of the inputs."""
+        part = searched_rows(record) if self.innovations else record
+        fitted, noise_model, sentences = self.first_fit(
+            noise_model, part, search=search, may_take_offsets="offset" in open_kinds
+        )
+        fitted = self.without_outliers(fitted)
+        if fitted.fit is not None and open_kinds:
+            fitted = self.with_proposals(fitted, fitted.fit, noise_model, open_kinds, sentences)
+        if part is not record and fitted.fit is not None:
+            fitted = self.on_all_rows(fitted, fitted.fit, record)
+        return self.with_unseen_offsets(fitted) if "offset" in open_kinds else fitted
 
     def first_fit(
         self, states: NoiseStates, log: RecordedLog, *, search: bool, may_take_offsets: bool
@@ -414,14 +423,14 @@ class _Fitting:
         problem = again.problem.with_notes(*before, *sentences)
         return self.without_outliers(replace(again, problem=problem, losses=fitted.losses))
 
-    def on_whole(self, fitted: _FittedProblem, fit: InnovationsFit, log: RecordedLog) -> _FittedProblem:
+    def on_all_rows(self, fitted: _FittedProblem, fit: InnovationsFit, log: RecordedLog) -> _FittedProblem:
         """Return the fit of the whole log, which begins at that of its first rows."""
         delay = fitted.problem.log.input_delay - log.input_delay
         problem = fitted.problem.with_whole_log(log.shifted(delay) if delay else log)
         for _ in range(OUTLIER_ROUNDS):
             whitened, innovations, variances = Likelihood(problem).innovations(fit.v)
             judged = replace(fit, whitened=whitened, innovations=innovations, variances=variances)
-            kept = _without_standing_out(problem, judged)
+            kept = _without_outlying_rows(problem, judged)
             if kept is None:
                 break
             problem = problem.with_log(kept)
@@ -467,7 +476,7 @@ class _Fitting:
             if fitted.fit is None:
                 break
             problem = fitted.problem
-            kept = _without_standing_out(problem, fitted.fit)
+            kept = _without_outlying_rows(problem, fitted.fit)
             if kept is None:
                 break
             self.note("without samples that stand out")
@@ -477,7 +486,7 @@ class _Fitting:
         return fitted
 
 
-def _without_standing_out(problem: CalibrationProblem, fit: InnovationsFit) -> RecordedLog | None:
+def _without_outlying_rows(problem: CalibrationProblem, fit: InnovationsFit) -> RecordedLog | None:
     """Return the log without samples that stand out from what a fit predicts, with a note for each sensor; `None` where
     there are none."""
     alone = standing_out(fit.whitened)
@@ -486,8 +495,8 @@ def _without_standing_out(problem: CalibrationProblem, fit: InnovationsFit) -> R
         return None
     off, names, log = np.abs(fit.innovations).T, problem.output_names, problem.log
     told = [
-        f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
-        f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
+        f"Samples of {name} stand out by more than {OUTLYING:g} deviations (row "
+        f"{listed_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
         for i, name in enumerate(names)
         if wrong[:, i].any()
     ]
@@ -521,9 +530,9 @@ def _innovations(
     return problem, fit, replace(error, moved=moved)
 
 
-def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
+def require_plant(model: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
     """Return the plant whose matrices hold the constants: that before elimination and sampling, if there were any."""
-    plant = getattr(given, "source", given)
+    plant = getattr(model, "source", model)
     uncertainty = getattr(plant, "uncertainty", None)
     if uncertainty is not None and uncertainty.steps:
         made = getattr(plant, "_made_from", None)
@@ -535,7 +544,7 @@ def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescri
         plant = made[0]
     if not isinstance(plant, (DAEModel, DescriptorSystem, TimeVaryingDescriptorSystem)):
         raise SpecError(
-            f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",
+            f"model is {type(model).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",
             path="model",
         )
     require_no_delays(plant, "A calibration")

@@ -38,17 +38,17 @@ INTERVAL = 0.95
 #: A test fails below this probability.
 SIGNIFICANT = 0.01
 
-#: A change of the mean is told above this confidence, shared by all rows at which it may be.
+#: A change of the mean is reported above this confidence, shared by all rows at which it may be.
 CHANGE_CONFIDENCE = 0.999
 
 #: Rows at both ends between which a change is looked for, and how many there must be at all.
 CHANGE_MARGIN, LEAST_DIAGNOSED_ROWS = 5, 20
 
-#: The mean of whitened innovations is told where it is this many of its deviations from zero.
+#: The mean of whitened innovations is reported where it is this many of its deviations from zero.
 MEAN_LIMIT = 4.0
 
 #: A whitened innovation of this size stands out.
-STANDS_OUT = 6.0
+OUTLYING = 6.0
 
 #: The standard deviation of a normal distribution over its median of absolute values; the largest share of samples that
 #: are wrong, of a sensor that is right.
@@ -172,7 +172,7 @@ def standing_out(whitened: FloatArray) -> BoolArray:
         measured = np.isfinite(column)
         if measured.sum() < LEAST_DIAGNOSED_ROWS:
             continue
-        far = measured & (np.abs(column) > STANDS_OUT * usual_size(column))
+        far = measured & (np.abs(column) > OUTLYING * usual_size(column))
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
         alone = far & (~beside | _answered(column, far))
         if alone.sum() <= MOST_OUTLIERS * measured.sum():

@@ -17,12 +17,11 @@ from obsynth.numerics.arrays import FloatArray
 #: Gains below this are no explanation: three nats are one in twenty.
 LEAST_EXPLANATION = 3.0
 
-#: Explanations that are told, and constants that are tried: each costs a run over the log.
-MOST_TOLD, MOST_CONSTANTS = 3, 12
+#: Explanations that are reported, and constants that are tried: each costs a run over the log.
+MOST_LISTED, MOST_CONSTANTS = 3, 12
 
 #: Relative change of a constant by which its effect on the innovations is found: small beside any error worth telling.
 CONSTANT_CHANGE = 1e-3
-
 
 #: What may be wrong, and the nats that it gains on this log.
 Explanation: TypeAlias = tuple[str, float]
@@ -60,7 +59,7 @@ def explanations(
     clear = sorted((item for item in candidates if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
     tried = [
         (text, _of_run(innovations, with_constant(*values[text])) if text in values else gain)
-        for text, gain in clear[:MOST_TOLD]
+        for text, gain in clear[:MOST_LISTED]
     ]
     return tuple(sorted((item for item in tried if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1]))
 

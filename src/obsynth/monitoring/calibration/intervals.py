@@ -53,7 +53,7 @@ LEAST_CUT, SHORT_INTERVAL = 0.1, 1e-3
 #: Along a valley: longest step in widths of the bounds, Newton's steps at each, and the gain in nats that ends them.
 VALLEY_STEP, VALLEY_NEWTON_STEPS, VALLEY_TOLERANCE = 0.0625, 8, 1e-3
 
-#: The share of that step at which an end is told.
+#: The share of that step at which an end is reported.
 LEAST_VALLEY_STEP = 0.0625
 
 

@@ -40,7 +40,6 @@ INVARIANT = {**{name: (name,) for name in "EABCD"}, "G": ("Bf", "Bd"), "L": ("Df
 
 Symbols = Mapping[str, Any]
 
-
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
 FIRST_CORRELATION, LEAST_CORRELATION, LONGEST_SHARE = 10.0, 0.3, 1.0
 

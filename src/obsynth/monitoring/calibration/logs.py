@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | RecordedLog"
 
-#: Stamps further off the grid than this share of a step are refused, and further than the second are told.
+#: Stamps further off the grid than this share of a step are refused, and further than the second are reported.
 LARGEST_JITTER = 0.2
 
 NOTED_JITTER = 0.02
@@ -43,7 +43,7 @@ QUANTUM_SLACK = 0.02
 DISTINCT_SHARE = 0.7
 
 #: Rows of wrong values that are named.
-TOLD_ROWS = 5
+MOST_LISTED_ROWS = 5
 
 #: Decimals to which values of a column are compared, and the share of the largest below which a step is
 #: rounding.
@@ -142,7 +142,7 @@ class RecordedLog:
         for i, name in enumerate(self.output_names):
             rows = np.flatnonzero(wrong[:, i])
             if len(rows):
-                listed = told_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
+                listed = listed_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
                 notes.append(
                     f"{counted(len(rows), 'value')} of {name} far from all others, counted as not measured ({listed})."
                 )
@@ -157,9 +157,9 @@ class RecordedLog:
         return replace(self, y=read_only(y), notes=(*self.notes, "What a stuck sensor repeats counts as not measured."))
 
 
-def told_rows(rows: Sequence[Any] | NDArray[np.int64]) -> str:
+def listed_rows(rows: Sequence[Any] | NDArray[np.int64]) -> str:
     """Return the first few rows as a sentence names them."""
-    return ", ".join(map(str, rows[:TOLD_ROWS])) + (", ..." if len(rows) > TOLD_ROWS else "")
+    return ", ".join(map(str, rows[:MOST_LISTED_ROWS])) + (", ..." if len(rows) > MOST_LISTED_ROWS else "")
 
 
 def read_log(

@@ -23,7 +23,7 @@ from obsynth.monitoring.calibration.maximum import Objective
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem
-from obsynth.monitoring.calibration.reporting import COLOURED_SHARE, FIRST_KEPT
+from obsynth.monitoring.calibration.reporting import COLOURED_SHARE, FIRST_AUTOCORRELATIONS
 from obsynth.monitoring.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel
@@ -40,19 +40,16 @@ LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLAN
 #: are moved to see what they explain, in widths of their bounds.
 LEAST_OFFSET_GAIN, SMALL_MOVE = 2.0, 1e-4
 
-
 _STATE_SENTENCES = {
     "coloured": "The noise of {name} is coloured: the model has a state for it (better by {gain:.3g} nats).",
     "offset": "The sensor {name} has an offset: the model has a state for it (better by {gain:.3g} nats).",
     "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
 }
 
-
 _OFFSET_HIDES = (
     "At constant inputs {faults} cannot be distinguished from the offset of {name}: a design for both may be "
     "refused. If the sensor has no offset, state this (offset: {{}} in calibrate)."
 )
-
 
 #: Wrong samples in a row at most, and how many after them must be where they are predicted.
 LONGEST_RUN, RETURNED = 5, 3
@@ -204,7 +201,7 @@ class _SearchStart:
             for j, name in enumerate(problem.output_names):
                 if correlation_name(name) in self.t or noise_state(name) not in problem.noisy:
                     continue
-                time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_KEPT)))
+                time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_AUTOCORRELATIONS)))
                 if correlation_name(name) in problem.unknown:
                     t[correlation_name(name)] = float(np.log(time))
                 variances["Q", noise_state(name)] = process_variance(

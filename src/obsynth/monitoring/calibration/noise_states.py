@@ -39,7 +39,7 @@ class NoiseStates:
         return bool(self.correlations or self.offsets or self.loads)
 
 
-def asked_states(
+def stated_noise_states(
     sensor_noise: Mapping[str, Any] | None, offset: Any, walks: Any, output_names: Sequence[str]
 ) -> NoiseStates:
     """Return the states that a caller asks for; what is white needs none."""

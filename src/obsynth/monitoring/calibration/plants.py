@@ -24,7 +24,6 @@ CALIBRATED_STATE_SHARE = 0.1
 #: A load, or an initial state, is sized by what it does to the outputs in this many samples.
 SIZED_SAMPLES = 50
 
-
 #: A discrete plant is stepped as it is.
 EXACT_STEP = "exact"
 
@@ -49,9 +48,9 @@ class CalibrationPlant(ABC):
 
     own_integration: str  # unless something else is asked for; a discrete plant is stepped as it is
 
-    def integration(self, asked: str) -> str:
+    def integration(self, option: str) -> str:
         """Return how the plant is integrated at first."""
-        return self.own_integration if asked == "auto" or self.own_integration == EXACT_STEP else asked
+        return self.own_integration if option == "auto" or self.own_integration == EXACT_STEP else option
 
     @abstractmethod
     def signals(self, log: RecordedLog) -> FloatArray:

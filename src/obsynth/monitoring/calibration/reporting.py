@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from obsynth.monitoring.calibration.diagnostics import (
+    OUTLYING,
     SIGNIFICANT,
-    STANDS_OUT,
     Consistency,
     Whiteness,
     change_of_mean,
@@ -20,7 +20,7 @@ from obsynth.monitoring.calibration.diagnostics import (
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.integration_error import IntegrationError
 from obsynth.monitoring.calibration.intervals import Side, covariance_of, quantile
-from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, told_rows
+from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, listed_rows
 from obsynth.monitoring.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.result import Calibration
@@ -34,10 +34,10 @@ from obsynth.plants.noise import noise_state, noise_variance, offset_state
 #: Constants whose correlation exceeds this are named together.
 CORRELATED = 0.9
 
-#: A sensor's variance below this multiple of its quantisation's is told.
+#: A sensor's variance below this multiple of its quantisation's is reported.
 AT_QUANTISATION = 1.5
 
-#: A timing that is better by this many nats is told, even where it is not taken.
+#: A timing that is better by this many nats is reported, even where it is not taken.
 NOTED_NATS = 2.0
 
 #: A variance of a sensor above this share of what its signal has stands for the signal.
@@ -46,9 +46,8 @@ SIGNAL_SHARE = 0.1
 #: A constant within this share of the bounds' width from one of them is at it.
 END_SHARE = 1e-6
 
-
 #: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
-FIRST_KEPT, COLOURED_SHARE = (0.3, 0.98), 0.7
+FIRST_AUTOCORRELATIONS, COLOURED_SHARE = (0.3, 0.98), 0.7
 
 
 def reported(
@@ -120,7 +119,7 @@ def reported(
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
         _outlier_sizes(problem.log, np.sqrt(np.median(result.variances, axis=0))),
-        _found_offsets(problem, result),
+        _fitted_offsets(problem, result),
     )
 
 
@@ -164,7 +163,7 @@ def _noise_model(
     return sensors, offsets, {name: step * Q[name] ** 0.5 for name in states.loads}
 
 
-def _found_offsets(problem: CalibrationProblem, fit: InnovationsFit) -> dict[str, tuple[float, float]]:
+def _fitted_offsets(problem: CalibrationProblem, fit: InnovationsFit) -> dict[str, tuple[float, float]]:
     """Return the offset of each sensor after the last row, and its deviation."""
     if not isinstance(problem.plant, PlantWithNoise) or fit.at_end is None:
         return {}
@@ -264,7 +263,7 @@ def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]
     by_output = {}
     for name, sizes, deviation in zip(log.output_names, log.outliers, deviations, strict=False):
         if len(sizes):
-            usual, least, share = STANDS_OUT * float(deviation), float(sizes.min()), 1.0 / (len(sizes) + 1)
+            usual, least, share = OUTLYING * float(deviation), float(sizes.min()), 1.0 / (len(sizes) + 1)
             by_output[name] = usual**share * least ** (1.0 - share)
     return by_output
 
@@ -289,10 +288,10 @@ def _misfits(problem: CalibrationProblem, start: Fit, whitened: FloatArray, R: d
                 f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
                 "offset that the model lacks."
             )
-        rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > STANDS_OUT)
+        rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > OUTLYING)
         if len(rows):
             sentences.append(
-                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told_rows(rows)}): "
+                f"Samples of {name} stand out by more than {OUTLYING:g} deviations (row {listed_rows(rows)}): "
                 "if they are outliers, mark them as missing."
             )
     return sentences

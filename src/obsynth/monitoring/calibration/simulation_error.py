@@ -185,7 +185,9 @@ def simulation_fits(
     return fits
 
 
-def with_seen_start(problem: CalibrationProblem, fit: Fit, *, first: FloatArray | None = None) -> CalibrationProblem:
+def with_observed_start(
+    problem: CalibrationProblem, fit: Fit, *, first: FloatArray | None = None
+) -> CalibrationProblem:
     """Return the problem with a wider covariance of the initial state, where the log begins elsewhere. A start that
     nobody stated would else look like a fault in the first rows. It is seen in the fit, or in the ``first`` whitened
     innovations ``(rows, ny)``: then a fit that hardly knows it says where it is."""
@@ -277,10 +279,10 @@ def _remedy(problem: CalibrationProblem, simulated: FloatArray, bad: BoolArray) 
         return "Check units and scales (a factor of 1000?)"
     names = ", ".join(problem.output_names[i] for i in away)
     able = problem.plant.walking
-    given = f" (walks: {', '.join(able)})" if able else ", for which the model needs an unknown input or a parameter"
+    walks = f" (walks: {', '.join(able)})" if able else ", for which the model needs an unknown input or a parameter"
     return (
         f"The simulation runs away from {names} as a constant that is integrated does: a force, a flow or an offset of "
-        f"an input that the model lacks. Take one as a random walk{given}, state what the input is off by, or check "
+        f"an input that the model lacks. Take one as a random walk{walks}, state what the input is off by, or check "
         "units and scales"
     )
 

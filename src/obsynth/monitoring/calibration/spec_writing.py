@@ -24,7 +24,7 @@ CALIBRATED_SPEC = FileKind("a spec that obsynth has calibrated", rb"\A# Calibrat
 _DAE, _RECURSIVE = "dae-adaptive-observer", ("descriptor-kalman", "adaptive-observer")
 
 #: What a plant says of noise, all of which a calibration finds anew.
-_FOUND_NOISE = ("sensor_noise", "offset", "walks", "process_noise", "Bw", "Dw", "noise_names")
+_CALIBRATED_NOISE = ("sensor_noise", "offset", "walks", "process_noise", "Bw", "Dw", "noise_names")
 
 
 def calibrated_spec(path: Path, result: Calibration, *, calibration: Path | None = None) -> str:
@@ -60,7 +60,7 @@ def calibrated_spec(path: Path, result: Calibration, *, calibration: Path | None
         own = read_yaml(path.parent / plant["file"], where="plant.file")
         own.pop("schema_version", None)
         plant = own | {name: value for name, value in plant.items() if name != "file"}
-    plant = {name: value for name, value in plant.items() if name not in _FOUND_NOISE}
+    plant = {name: value for name, value in plant.items() if name not in _CALIBRATED_NOISE}
     linear = plant.get("kind") != "dae" or bool((plant.get("transform") or {}).get("linearise"))
     method = {"id": "auto", **(document.get("method") or {})}
     options = dict(method.get("options") or {})

@@ -24,7 +24,6 @@ from obsynth.observers.nonlinear.c_code import compiler, shared_library
 #: Optimisation costs more than it gains on straight code of thousands of lines.
 STRAIGHT_CODE_FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
 
-
 #: Newton iterations of every step, from the last sample's state, and further ones where the residual is above
 #: `SOLVED_STEP`.
 ITERATIONS, FURTHER_ITERATIONS = 3, 8

@@ -47,21 +47,20 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign
 
-#: Nats that a variance of the design must cost, the others being free, before its ratio is told.
+#: Nats that a variance of the design must cost, the others being free, before its ratio is reported.
 CLEAR_NATS = 3.0
 
-#: Where something else explains coloured innovations, variances are told if they explain this many times as many nats:
-#: process noise and coloured sensor noise are hardly distinguished on one log.
+#: Where something else explains coloured innovations, variances are reported if they explain so many times
+#: as many nats: process noise and coloured sensor noise are hardly distinguished on one log.
 CLEARLY_MORE = 1.25
 
-#: Ratios nearer to one than this factor are not told: nobody knows a variance better.
-TOLD_FACTOR = 1.5
+#: Ratios nearer to one than this factor are not reported: nobody knows a variance better.
+REPORTED_SPREAD_RATIO = 1.5
 
 #: A factor this near a whole number, of that, is written as its word: it is an estimate itself.
 WORD_SHARE = 0.25
 
-
-#: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
+#: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is reported.
 OFFSET = 3.0
 
 #: Rows that a log must have at least.
@@ -184,7 +183,7 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
     try:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
-        # Without a likelihood nothing can be told of its variances.
+        # Without a likelihood nothing can be reported of its variances.
         return {}, 0.0, walk
     q, r = variance_names(model.equation_names, model.output_names)
     keys = dict(zip(model.equation_names, q, strict=True))
@@ -239,7 +238,7 @@ def _variance_problem(
 def _contradicted_ratio(objective: Objective, best: Maximum, i: int, variance: float) -> float | None:
     """Return the likeliest over a designed variance where the log contradicts that clearly, else `None`."""
     ratio = float(np.exp(best.z[i]) / variance)
-    if max(ratio, 1.0 / ratio) <= TOLD_FACTOR:
+    if max(ratio, 1.0 / ratio) <= REPORTED_SPREAD_RATIO:
         return None
     z = best.z.copy()
     z[i] = np.log(variance)

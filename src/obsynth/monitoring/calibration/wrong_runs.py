@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.monitoring.calibration.diagnostics import (
     LEAST_DIAGNOSED_ROWS,
     MOST_OUTLIERS,
-    STANDS_OUT,
+    OUTLYING,
     BoolArray,
     usual_size,
 )
@@ -28,7 +28,7 @@ def wrong_runs(problem: CalibrationProblem, fit: InnovationsFit) -> BoolArray:
     measured = np.isfinite(problem.y)
     enough = measured.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
     usual = np.array([usual_size(e) if many else np.inf for e, many in zip(fit.whitened.T, enough, strict=True)])
-    far = measured & (np.abs(fit.whitened) > STANDS_OUT * usual)
+    far = measured & (np.abs(fit.whitened) > OUTLYING * usual)
     for i in range(far.shape[1]):
         for first, last in _groups(far[:, i]):
             if np.delete(far[first : last + 1], i, axis=1).any():
@@ -62,7 +62,7 @@ def _end(
         after = np.flatnonzero(np.isfinite(y[end + 1 :, output]))[:RETURNED] + end + 1
         if (
             len(after) == RETURNED
-            and (np.abs(whitened_run(problem, fit.v, y)[after, output]) <= STANDS_OUT * usual).all()
+            and (np.abs(whitened_run(problem, fit.v, y)[after, output]) <= OUTLYING * usual).all()
         ):
             return end
     return None

@@ -47,10 +47,8 @@ NEEDED_PACKAGES = {
 #: How pandas calls the column of an index without a name.
 _UNNAMED_INDEX = "__index_level_"
 
-
 #: Waveforms whose samples are further apart than this share of their interval are no rows of one table.
 LARGEST_SHIFT = 0.5
-
 
 #: How files of these kinds begin.
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}

@@ -130,7 +130,7 @@ class Clock:
         last = self.last
         if last is None or not math.isfinite(time) or (self.left_out >= MOST_STALE and not self.is_resumed):
             return ""
-        # Of a sampled design the last sample may be told a little later than its stamp.
+        # Of a sampled design the last sample may be reported a little later than its stamp.
         before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last
         if time > before and time != last:
             return ""

@@ -99,7 +99,7 @@ class LinearLogObserver(LogObserver):
         self.transient = transient(self.observer)
         # Of every fault of the plant; those of which nothing is estimated are held to be absent.
         self.fault = np.zeros(self.plant.nf)
-        self.told_faults = missing.estimated_faults
+        self.estimated_faults = missing.estimated_faults
         self.measured = self.v
         self.kept_inputs = missing.kept_inputs
         self.inputs = np.zeros((0, self.nu))
@@ -193,12 +193,12 @@ class LinearLogObserver(LogObserver):
         if status != RECOVERING:
             self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
             return None
-        excess = self._shown_excess()
+        excess = self._output_excess()
         if self.observer.dt > 0.0:
             self.excess = self.observer.Az @ self.excess
         return excess
 
-    def _shown_excess(self) -> FloatArray:
+    def _output_excess(self) -> FloatArray:
         return np.asarray(self.carried + np.abs(self.observer.Cz @ self.excess).sum(axis=1))
 
     def _advance_excess(self, seconds: float) -> None:
@@ -274,7 +274,7 @@ class LinearLogObserver(LogObserver):
     def _faults_in(self, row: FloatArray) -> FloatArray:
         """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
         faults = np.zeros(len(self.fault))
-        faults[self.told_faults] = row[self.observer.fault_rows]
+        faults[self.estimated_faults] = row[self.observer.fault_rows]
         return faults
 
     def _count(self, changes: FloatArray) -> None:
@@ -363,7 +363,7 @@ class LinearLogObserver(LogObserver):
             self._restart()
             return self._held()
         if self.model is None:
-            self.carried, self.excess = self._shown_excess(), np.zeros_like(self.excess)
+            self.carried, self.excess = self._output_excess(), np.zeros_like(self.excess)
             inputs = self.inputs if self.observer.dt > 0.0 else ()
             self.model, self.held = self.gap_model.start(self.seen, inputs, self.fault), self.v[: self.nu]
             if self.observer.dt == 0.0:
@@ -383,7 +383,7 @@ class LinearLogObserver(LogObserver):
             self.left = self.observer.Az @ self.left + self.b * from_model
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v + self.observer.added)
         self._taken(v)
-        row[self.observer.fault_rows] = self.fault[self.told_faults]
+        row[self.observer.fault_rows] = self.fault[self.estimated_faults]
         row[self.observer.residual_rows] = np.nan
         if not np.isfinite(self.z).all():
             self._restart()
@@ -413,5 +413,5 @@ class LinearLogObserver(LogObserver):
 
     def _held(self) -> FloatArray:
         row = np.full(len(self.observer.Cz), np.nan)
-        row[self.observer.fault_rows] = self.fault[self.told_faults]
+        row[self.observer.fault_rows] = self.fault[self.estimated_faults]
         return row

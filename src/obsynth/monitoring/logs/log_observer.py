@@ -1,4 +1,4 @@
-"""An observer on rows of a log: what it says of each, and what every kind of observer has there."""
+"""The interface of an observer that runs on the rows of a log, and its result at each row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: What a row of estimates is.
+#: Statuses of a row of estimates.
 OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
 
 #: A row in which a scheduling parameter is outside its region, or was so recently that nothing is claimed yet.
@@ -34,13 +34,13 @@ class Row(NamedTuple):
 
     status: str  # ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering`` or ``out``
     values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
-    skipped: int = 0  # how many rows were missing before this one that nothing stands for
+    skipped: int = 0  # rows missing before this one for which the observer has no row of its own
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
-    settled: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
-    # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
-    # than at its end; infinite where that is not known.
+    settled: bool = True  # whether the effects of gaps have decayed, so that guaranteed bounds hold
+    # Bound on what a gap has left in each value of a row that is recovering, if the model's error in the gap was never
+    # larger than at its end; infinite where that is not known.
     excess: FloatArray | None = None
-    bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
+    bridged: bool = False  # whether the plant's model replaced every missing sample since the warm-up
     # By how many times fault estimates are less certain than before samples were missing ``(nf,)``; ``None``: no less.
     unsure: FloatArray | None = None
     time: float = math.nan  # in seconds

@@ -51,7 +51,6 @@ ROWS_AT_ONCE = 4096
 #: A signal is far from its operating point when its mean differs by this share of it.
 FAR_FROM_POINT = 0.2
 
-
 RUN_STATE_KIND = "obsynth run state"
 
 RUN_STATE_VERSION = 1
@@ -410,7 +409,7 @@ class LogRun:
                 self.isolated = self.isolated or output.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 since = self.events.shelved_since(kind)
-                fault_text = output.fault if math.isnan(since) else SHELVED.format(self._shown_time(since))
+                fault_text = output.fault if math.isnan(since) else SHELVED.format(self._time_text(since))
                 names.append(f"{kind}: {fault_text}" if fault_text else kind)
         for name, evidence in self._stuck(row):
             self.events.take(name, "", evidence, time, number, [*before, *cells])
@@ -424,7 +423,7 @@ class LogRun:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
 
-    def _shown_time(self, time: float) -> str:
+    def _time_text(self, time: float) -> str:
         return f"{time:.15g}" if self.stamps is None else self.stamps.shown(time)
 
     def _stuck(self, row: Row) -> list[tuple[str, float]]:

@@ -28,7 +28,7 @@ from obsynth.monitoring.logs.unpacked_logs import as_frame, log_suffix, opened_l
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
-#: Decimals of seconds that dates are told to.
+#: Decimals of seconds that dates are reported to.
 SECOND_DECIMALS = 6
 
 

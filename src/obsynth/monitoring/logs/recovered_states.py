@@ -16,7 +16,6 @@ from obsynth.plants.transformations.recovery import StateRecovery
 #: Of plants with more states as written none is recovered unless asked for: each row would take too long.
 MOST_RECOVERED = 300
 
-
 #: Seconds of data that are compared with the operating point, and rows at most: a fast plant moves in a second.
 FIRST_SECONDS, MOST_FIRST_ROWS = 1.0, 100
 
@@ -55,7 +54,7 @@ class RecoveredStates:
         """Return the recovery of a design, of all states or of those asked for; `None` where there is nothing."""
         if recovery is None:
             return None
-        names = _asked_for(recovery, wanted)
+        names = _chosen_states(recovery, wanted)
         if not names:
             return None
         # Of a large map its operator knows the number of states from which the others follow.
@@ -91,7 +90,7 @@ class RecoveredStates:
         self._known = data["known"]
 
 
-def _asked_for(recovery: StateRecovery, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
+def _chosen_states(recovery: StateRecovery, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
     if wanted is None:
         return recovery.names if len(recovery.names) <= MOST_RECOVERED else ()
     if isinstance(wanted, str) and wanted in ("all", "none"):

@@ -25,7 +25,6 @@ _TIME_OF_DAY = re.compile(
     r"\d{1,2}:\d{2}(?::\d{2}\S*)?(?:\s*[AaPp]\.?[Mm]\.?)?(?:\s*(?:UTC|GMT|Z|[+-]\d\S*))?", re.IGNORECASE
 )
 
-
 #: The column of time stamps, in seconds.
 TIME_HEADER = "time"
 
@@ -36,7 +35,6 @@ _STATUS_NAMES = ("status", "quality")
 
 #: How a status begins that says that a value is bad.
 _BAD_STATUS = ("bad", "invalid", "not good")
-
 
 #: How columns of time stamps are often called; a column of dates stands beside one of times of day.
 _TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")

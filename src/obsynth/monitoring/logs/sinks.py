@@ -26,7 +26,6 @@ ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1
 #: Columns of a table that hold text.
 TEXT_COLUMNS = ("status", "alarm")
 
-
 #: Takes rows of cells: texts, and numbers of which NaN is an empty cell.
 Sink: TypeAlias = Callable[[Sequence[Sequence[Any]]], None]
 

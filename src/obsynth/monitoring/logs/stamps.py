@@ -75,7 +75,6 @@ LEAST_FALL, AUTUMN_FALL = 1800.0, 3600.0
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
-
 #: What the unit of the time may be called in a line of units, and how many of them are a second; empty: seconds.
 _UNITS_OF_TIME = {
     **dict.fromkeys(("", "-", "s", "sec", "secs", "second", "seconds", "sek"), 1.0),
@@ -95,7 +94,6 @@ _SERIAL_DAYS = ((32874.0, 73050.0), (726834.0, 767010.0))
 _ROWS_OF_DAYS = 3
 
 _STEP_IN_DAYS = 1.0 / 24.0
-
 
 #: A name of a column with a unit in brackets behind it.
 WITH_UNIT = re.compile(r"(.*\S)\s*[\[(]([^\[\]()]*)[\])]")

@@ -43,7 +43,7 @@ TURNED_SHARE = 0.5
 STUCK_ALARM_ROWS = 100
 
 #: Stretches in which an output is stuck that a note names.
-MOST_RUNS_TOLD = 3
+MOST_LISTED_RUNS = 3
 
 #: Rows of a stream that wait to be looked at together.
 _WAITING_ROWS = 1024
@@ -318,8 +318,8 @@ def stuck_texts(
     """Yield a sentence on each output that is stuck: ``shown`` says its rows, ``more`` what to do if its sensor was."""
     for name, runs in stuck.items():
         if runs:
-            where = ", ".join(rows_text(*run) for run in runs[:MOST_RUNS_TOLD])
-            further = f", and {len(runs) - MOST_RUNS_TOLD} more times" if len(runs) > MOST_RUNS_TOLD else ""
+            where = ", ".join(rows_text(*run) for run in runs[:MOST_LISTED_RUNS])
+            further = f", and {len(runs) - MOST_LISTED_RUNS} more times" if len(runs) > MOST_LISTED_RUNS else ""
             yield (
                 f"{name} repeats one value in {where}{further}, for longer than it otherwise does. Look whether its "
                 f"sensor was stuck{more}."

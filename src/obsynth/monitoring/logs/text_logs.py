@@ -36,7 +36,6 @@ MOST_REMARKS = 50
 #: Lines that may end with CR alone.
 _OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
-
 #: What groups thousands: a blank of some kind or an apostrophe, or a point or comma that is not the decimal mark, or
 #: stands twice; and a number whose only mark may do so.
 _GROUPED = re.compile(
@@ -46,10 +45,8 @@ _GROUPED = re.compile(
 
 _ONE_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 
-
 #: The name by which texts are opened that may hold such bytes.
 WINDOWS_TEXT = "obsynth.windows"
-
 
 #: What helps where a file is in another encoding than it seems to be.
 SAVE_AS_TEXT = "If another program reads it, save it there as UTF-8."

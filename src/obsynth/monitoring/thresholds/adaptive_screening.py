@@ -34,7 +34,6 @@ FIRST_WINDOW = 8
 #: Rings after which a signal no longer matters beyond rounding.
 REMEMBERED_RINGS = 8
 
-
 #: Values ``(steps, runs)`` that surely pass the threshold, and values that surely do not.
 Sides: TypeAlias = tuple[np.ndarray, np.ndarray]
 
@@ -73,7 +72,7 @@ class Screening:
         n, nu = bound.drive.shape[2] - structure.inputs.shape[1], structure.inputs.shape[1]
         first = np.zeros((rows + no, n + nu))
         for span, part in zip(bound.spans, bound.drive, strict=True):
-            first += span * responses.gain(bound.shown, part[:nz], part[nz:])
+            first += span * responses.gain(bound.output_rows, part[:nz], part[nz:])
         slack = FIRST_ORDER_ROUNDING * first[rows:]
         ny = bound.rounding.shape[1] - 1 - n - nu
         order = [*range(nu + ny, nu + ny + n), *range(nu)]

@@ -11,7 +11,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
 )
 from obsynth.numerics.arguments import is_finite_number
 
-#: Seconds of the units of time in which a rate is told.
+#: Seconds of the units of time in which a rate is reported.
 UNITS = {
     "second": 1.0,
     "minute": 60.0,

@@ -33,10 +33,10 @@ from obsynth.verification.over_tolerances.plants_of_the_box import with_toleranc
 STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma", "disturbance")
 
 
-def refuse_bounds(given: Mapping[str, Any]) -> None:
+def refuse_bounds(options: Mapping[str, Any]) -> None:
     """Raise `SpecError` where bounds are given for a guaranteed test: those of its design count."""
     # The command line gives a mapping without entries where nothing is stated.
-    stated = [name for name, value in given.items() if value is not None and value != {}]
+    stated = [name for name, value in options.items() if value is not None and value != {}]
     if stated:
         raise SpecError(
             f"{', '.join(stated)} cannot be given for a guaranteed test: its bounds are those of its design. Design it "
@@ -45,12 +45,12 @@ def refuse_bounds(given: Mapping[str, Any]) -> None:
         )
 
 
-def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> GuaranteedTest:
+def _checked(design: ObserverDesign, kind: str, options: Mapping[str, Any]) -> GuaranteedTest:
     if kind != "pointwise":
         raise SpecError(
             f"kind is {kind!r}: a guaranteed test has its own threshold, use pointwise (the default).", path="kind"
         )
-    refuse_bounds({name: given[name] for name in STATED_BY_DESIGN})
+    refuse_bounds({name: options[name] for name in STATED_BY_DESIGN})
     test, why = GuaranteedTest.of(design), ""
     if isinstance(test.observer, WindowObserver):
         why = "A test of a plant that changes with k is for an exact model from any start: leave this out."
@@ -64,7 +64,7 @@ def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> Gua
             "This guaranteed test is for an exact model: design it for a plant whose constants have tolerances, with a "
             "scenario, so that an observer of the state runs beside it."
         )
-    refused = [name for name in ("constants", "initial_set") if given[name] is not None]
+    refused = [name for name in ("constants", "initial_set") if options[name] is not None]
     if why and refused:
         raise SpecError(why, path=refused[0])
     return test
@@ -106,10 +106,10 @@ def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     )
 
 
-def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given: Mapping[str, Any]) -> Monitor:
-    """Return the monitor of records as long as a scenario; ``given``: the options of a monitor by name."""
-    test = _checked(design, kind, given)
-    constants, initial_set = given["constants"], given["initial_set"]
+def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, options: Mapping[str, Any]) -> Monitor:
+    """Return the monitor of records as long as a scenario; ``options``: the options of a monitor by name."""
+    test = _checked(design, kind, options)
+    constants, initial_set = options["constants"], options["initial_set"]
     if isinstance(test.observer, WindowObserver):
         raise SpecError(
             "A test whose weights change with k is for measured data: use obsynth.online_monitor, or alarms() and "
@@ -123,7 +123,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     floors = [
         float(np.max(signals @ row_test.certificate.matrices["rounding"].ravel(), initial=0.0)) for row_test in tests
     ]
-    # Of a bank each row is told in units of its own threshold, with what rounding adds.
+    # Of a bank each row is reported in units of its own threshold, with what rounding adds.
     limits = np.array([row_test.threshold for row_test in tests])
     scales = limits + floors if is_bank(test) else np.ones(1)
     threshold = np.full(len(runs.outputs), 1.0 if is_bank(test) else limits[0])
@@ -349,10 +349,10 @@ class VaryingRule(Rule):
         return [*self._limits.tolist()]
 
 
-def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> Monitor:
+def data_monitor(design: ObserverDesign, kind: str, options: Mapping[str, Any]) -> Monitor:
     """Return the monitor of data of any length; with constants or a start its threshold follows the signals."""
-    test = _checked(design, kind, given)
-    constants, initial_set = given["constants"], given["initial_set"]
+    test = _checked(design, kind, options)
+    constants, initial_set = options["constants"], options["initial_set"]
     own = test.observer if isinstance(test.observer, WindowObserver) else None
     observer: LinearObserver | WindowObserver = test.linear[1] if own is None else own
     rule: Rule = GuaranteedRule(test) if own is None else VaryingRule(test, own)

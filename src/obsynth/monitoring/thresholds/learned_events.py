@@ -13,10 +13,10 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Parts of a log whose largest statistics are compared, the share of them that is taken as usual, and how many times
 #: that an event stands out at least: a fifth of the parts of a log may hold events.
-LOG_PARTS, USUAL_PARTS_SHARE, EVENT_STANDS_OUT = 20, 0.75, 2.0
+LOG_PARTS, USUAL_PARTS_SHARE, EVENT_SIZE = 20, 0.75, 2.0
 
 #: So many events, and this share of the rows, may be left out at most: what comes more often is how the plant is.
-MOST_LEFT_EVENTS, MOST_LEFT_OUT = 5, 0.1
+MOST_EXCLUDED_EVENTS, MOST_EXCLUDED_SHARE = 5, 0.1
 
 
 class Event(NamedTuple):
@@ -42,18 +42,16 @@ def events_of(
     values = np.maximum(statistic_sizes, signal_sizes)
     places = np.flatnonzero(values > 1.0)
     stretches = np.split(places, np.flatnonzero(np.diff(places) > HOLD) + 1)
-    out = [part for part in stretches if part.size and values[part].max() > EVENT_STANDS_OUT]
-    if len(out) > MOST_LEFT_EVENTS or sum(part[-1] - part[0] + 1 for part in out) > MOST_LEFT_OUT * len(x):
+    out = [part for part in stretches if part.size and values[part].max() > EVENT_SIZE]
+    if len(out) > MOST_EXCLUDED_EVENTS or sum(part[-1] - part[0] + 1 for part in out) > MOST_EXCLUDED_SHARE * len(x):
         return ()
     own = np.abs(statistics.model.whitened(x) @ np.linalg.inv(statistics.model.whitener).T)
     own = own / np.sqrt(np.nanmean(own**2, axis=0))
     events = []
     for part in out:
-        first = int(part[values[part] > EVENT_STANDS_OUT][0])
+        first = int(part[values[part] > EVENT_SIZE][0])
         # Statistics look back: after the event they fade, from their largest value on.
-        last = int(
-            part[(signal_sizes[part] > EVENT_STANDS_OUT) | (statistic_sizes[part] == statistic_sizes[part].max())][-1]
-        )
+        last = int(part[(signal_sizes[part] > EVENT_SIZE) | (statistic_sizes[part] == statistic_sizes[part].max())][-1])
         signal = columns[int(np.argmax(np.nan_to_num(own[first : last + 1]).max(axis=0)))]
         events.append(Event(first, last, int(part[0]), int(part[-1]), signal))
     return tuple(events)

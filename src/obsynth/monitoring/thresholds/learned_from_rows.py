@@ -235,18 +235,18 @@ class Raised(NamedTuple):
 
 
 def raised_levels(
-    design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray, scores: Scores | None, **given: Any
+    design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray, scores: Scores | None, **options: Any
 ) -> Raised:
-    """Return what in ``rows (n, m)`` raises the levels that were ``learned`` with what was ``given`` to
+    """Return what in ``rows (n, m)`` raises the levels that were ``learned`` with these ``options`` of
     `thresholds_from_rows`: no events where none do by much."""
-    complete = whole_rows(design, learned, rows)
+    complete = complete_rows(design, learned, rows)
     usual = _usual_scores(scores, complete) if learned.statistics.estimates and scores is not None else None
     x = watched_rows(design, learned, rows)
     events = events_of(x, learned.columns, learned.statistics, learned.levels, usual, learned.centres)
     without_events = rows.copy()
     for event in events:
         without_events[event.begun : event.ended + 1] = np.nan
-    count = int(whole_rows(design, learned, without_events).sum())
+    count = int(complete_rows(design, learned, without_events).sum())
     every_other = learned.pairs.others(learned.every)
     if (
         not events
@@ -257,7 +257,7 @@ def raised_levels(
 
     def compared(before: LearnedThresholds, *, validated: bool) -> tuple[float, str]:
         relearned = thresholds_from_rows(
-            design, without_events, scores=scores, like=learned, validated=validated, **given
+            design, without_events, scores=scores, like=learned, validated=validated, **options
         )
         if relearned.statistics.names != before.statistics.names:
             return 1.0, ""
@@ -266,7 +266,7 @@ def raised_levels(
         return by_statistic[most], most
 
     # The largest of few parts say little of rare rows: these alone tell whether events stand out.
-    inside = thresholds_from_rows(design, rows, scores=scores, like=learned, validated=False, **given)
+    inside = thresholds_from_rows(design, rows, scores=scores, like=learned, validated=False, **options)
     if compared(inside, validated=False)[0] < TOLD_LEVEL_FACTOR:
         return Raised()
     factor, most = compared(learned, validated=True)
@@ -276,10 +276,10 @@ def raised_levels(
 def watched_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> FloatArray:
     """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
     places = [watched_names(design).index(name) for name in learned.columns]
-    return np.where(whole_rows(design, learned, rows)[:, None], rows[:, places], np.nan)
+    return np.where(complete_rows(design, learned, rows)[:, None], rows[:, places], np.nan)
 
 
-def whole_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
+def complete_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
     """Return in which of ``rows (n, m)`` nothing is missing but what most of them lack ``(n,)``."""
     usual = [name not in learned.seldom for name in watched_names(design)]
     return np.asarray(np.isfinite(rows[:, usual]).all(axis=1))

@@ -58,14 +58,11 @@ ASSUMED = "; the plant starts from zero, known inputs are held or straight lines
 #: Where the residual is made not to see the faults that are modelled.
 OF_ESTIMATES = "the norm of the fault estimates, as modelled faults have no effect on the residual: "
 
-
 #: What a recursive or nonlinear observer learnt from a sample: a row of it.
 Evidence: TypeAlias = RawEstimate | DAERow
 
-
 #: In place of a fault's number: what is known does not distinguish the faults.
 NOT_DISTINGUISHED = -1
-
 
 RuleState: TypeAlias = Any
 

@@ -18,7 +18,7 @@ from obsynth.numerics.arrays import FloatArray
 MOVES = 5.0
 
 #: Rows from a move on whose residuals are compared with those of as many rows without one, the least number of moves,
-#: the share of the residuals that counts as large, and how many times as large these must be to be told.
+#: the share of the residuals that counts as large, and how many times as large these must be to be reported.
 AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
 
 

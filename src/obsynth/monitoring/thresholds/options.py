@@ -39,13 +39,13 @@ WINDOW, FALSE_ALARMS, CHANGE = 20, 0.01, 1.0
 
 
 def refuse_idle(
-    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], *, called: Callable[[str], str] = str
+    table: Mapping[str, tuple[str, ...]], kind: str, options: Mapping[str, Any], *, called: Callable[[str], str] = str
 ) -> None:
     """Raise `SpecError` where an option is given that does nothing for a kind of monitor, by what it is ``called``."""
     used = table.get(kind)
     if used is None:
         return  # who makes the monitor says which kinds there are
-    for name, value in given.items():
+    for name, value in options.items():
         # The command line gives a mapping without entries where nothing is stated.
         if value is None or (isinstance(value, Mapping) and not value) or name in used:
             continue
@@ -55,17 +55,17 @@ def refuse_idle(
 
 
 def checked_options(
-    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], isolation_delay: int = 0
+    table: Mapping[str, tuple[str, ...]], kind: str, options: Mapping[str, Any], isolation_delay: int = 0
 ) -> tuple[int, float, float]:
     """Return window, false_alarms and change as they are given, or by default; raise `SpecError` where an option does
     nothing for a kind of monitor, or is out of range."""
-    refuse_idle(table, kind, given)
+    refuse_idle(table, kind, options)
     for name in ("noise_bound", "initial_error", "gamma"):
-        value = given[name]
+        value = options[name]
         if value is not None:
             require_no_overflow(real_number(value, name, "a number, 0 or more", least=0.0), name, name)
     defaults: dict[str, Any] = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
-    window, false_alarms, change = (defaults[name] if given[name] is None else given[name] for name in defaults)
+    window, false_alarms, change = (defaults[name] if options[name] is None else options[name] for name in defaults)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
         whole_number(count, name, "a whole number of samples", least=least)
     real_number(false_alarms, "false_alarms", "a probability between 0 and 1", above=0.0, below=1.0)

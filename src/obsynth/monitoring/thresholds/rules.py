@@ -32,7 +32,6 @@ COUNT_ROUNDING = 1e-9
 #: What a rule says where nothing is decided.
 NOT_DECIDED = RuleOutput(math.nan, math.nan)
 
-
 ANY_LENGTH = " (the run may have any length)"
 
 

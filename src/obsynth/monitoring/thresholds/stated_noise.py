@@ -22,11 +22,10 @@ from obsynth.numerics.norms import hinf_norm, state_units
 from obsynth.verification.over_tolerances.responses import OUTWARD
 
 #: What is left of an error after the table.
-LEFT_AFTER_TABLE = 1e-3
+REMAINDER_AFTER_TABLE = 1e-3
 
 #: Longest table, and most numbers in its powers.
 LONGEST_TABLE, MOST_NUMBERS = 16_384, 20_000_000
-
 
 #: A bound by the number of samples since the start: a table, and a limit for every later one.
 UnlimitedHorizonBound: TypeAlias = tuple[FloatArray, float]
@@ -117,13 +116,13 @@ def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_erro
     responses = [model.C @ power for power in powers]
     start = np.array([np.linalg.norm(c, 2) for c in responses]) * initial_error
     start += np.array([_columns(c @ inputs.start) for c in responses])
-    start += _left_of_powers(model, powers, np.hstack([inputs.start, initial_error * np.eye(len(model.A))]))
-    per_sample = np.array([_columns(c @ inputs.B) for c in responses]) + _left_of_powers(model, powers, inputs.B)
+    start += _remainder_of_powers(model, powers, np.hstack([inputs.start, initial_error * np.eye(len(model.A))]))
+    per_sample = np.array([_columns(c @ inputs.B) for c in responses]) + _remainder_of_powers(model, powers, inputs.B)
     earlier = np.concatenate([[0.0], np.cumsum(per_sample)[:-1]])
     return np.asarray((start + earlier + _columns(inputs.D) + inputs.between) * OUTWARD)
 
 
-def _left_of_powers(model: ResidualModel, powers: list[FloatArray], columns: FloatArray) -> FloatArray:
+def _remainder_of_powers(model: ResidualModel, powers: list[FloatArray], columns: FloatArray) -> FloatArray:
     """Return what rounding of the powers may hide of columns ``(n, m)`` at each sample, to the first order.
 
     Where entries of A cancel, powers keep half of their digits.  What ``C A^k`` misses by from one sample to the next
@@ -193,12 +192,12 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     responses = [model.C @ power for power in powers]
     # Before the window is full it begins with the record.
     before, length = [np.zeros_like(model.C)] * (window - 1), np.minimum(np.arange(model.steps) + 1, window)
-    hidden = _left_of_powers(model, powers, initial_error * np.eye(len(model.A)))
+    hidden = _remainder_of_powers(model, powers, initial_error * np.eye(len(model.A)))
     start = _stacked_norms(before + responses, window) * initial_error
     start += _windowed_sums(np.concatenate([np.zeros(window - 1), hidden]), window)
     earlier = np.zeros(model.steps)
     if window < model.steps:
-        hidden_inputs = _left_of_powers(model, powers, inputs.B)
+        hidden_inputs = _remainder_of_powers(model, powers, inputs.B)
         gathered = np.cumsum(_stacked_columns([part @ inputs.B for part in responses], hidden_inputs, window))
         earlier[window:] = gathered[: model.steps - window]
     bound = (gain * np.sqrt(length * count) + start + earlier) * OUTWARD
@@ -206,10 +205,10 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
 
 
 def samples_of(transition: FloatArray, window: int) -> int:
-    """Return how many samples a table of ``transition (n, n)`` needs until `LEFT_AFTER_TABLE` of a start is left."""
+    """Return the length of a table of ``transition (n, n)``, after which `REMAINDER_AFTER_TABLE` of a start is left."""
     # Entries that cancel hide the eigenvalues in the powers of a matrix, but not in those of its Schur form.
     power, count = schur_form(transition)[0], 1
-    while len(power) and not np.linalg.norm(power, 2) <= LEFT_AFTER_TABLE:
+    while len(power) and not np.linalg.norm(power, 2) <= REMAINDER_AFTER_TABLE:
         power, count = np.triu(power @ power), 2 * count
         if count > LONGEST_TABLE or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
             raise SpecError(
@@ -258,10 +257,10 @@ def _window_limit(
     longer = replace(model, steps=model.steps + window - 1)
     powers = longer.powers()
     responses = [model.C @ power for power in powers]
-    hidden = _windowed_sums(_left_of_powers(longer, powers, np.eye(len(model.A))), window)
+    hidden = _windowed_sums(_remainder_of_powers(longer, powers, np.eye(len(model.A))), window)
     sizes = _stacked_norms(responses, window) + hidden
-    left_of_inputs = _left_of_powers(longer, powers, inputs.B)
-    gathered = float(np.sum(_stacked_columns([part @ inputs.B for part in responses], left_of_inputs, window)))
+    remainder_of_inputs = _remainder_of_powers(longer, powers, inputs.B)
+    gathered = float(np.sum(_stacked_columns([part @ inputs.B for part in responses], remainder_of_inputs, window)))
     aged = _columns(last @ inputs.B) * float(np.sum(sizes)) / (1.0 - contraction)
     start = float(max(np.max(sizes) * contraction, np.max(sizes[-window:]))) * initial_error
     return (gain * float(np.sqrt(window * count)) + gathered + aged + start) * OUTWARD

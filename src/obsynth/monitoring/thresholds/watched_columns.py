@@ -24,7 +24,7 @@ from obsynth.observers.window.observer import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 #: Share of an error at the start of a run below which rows are like those that follow.
-START_LEFT = 1e-3
+START_REMAINDER = 1e-3
 
 
 def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
@@ -53,7 +53,7 @@ def settling_rows(design: ObserverDesign) -> int:
     """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these.
 
     Of a Kalman filter whose gains tend to a steady state they are those in which the error at the start decays to
-    `START_LEFT` of itself.
+    `START_REMAINDER` of itself.
     """
     observer = design.observer
     if isinstance(observer, (LinearObserver, RegionObserver, ScheduledObserver)):
@@ -63,7 +63,7 @@ def settling_rows(design: ObserverDesign) -> int:
     contraction = settled_contraction(observer)
     if contraction is None or contraction >= 1.0:
         return SETTLING
-    return min(SETTLING, math.ceil(math.log(START_LEFT) / math.log(max(contraction, START_LEFT))))
+    return min(SETTLING, math.ceil(math.log(START_REMAINDER) / math.log(max(contraction, START_REMAINDER))))
 
 
 def has_innovations_by_sensor(observer: Any) -> bool:

@@ -18,7 +18,6 @@ from obsynth.numerics.arrays import FloatArray
 #: Probability with which an outlier is nearer than what is taken as their least size, and how many show that.
 NEARER, LEAST_WRONG = 1e-3, 4
 
-
 #: Samples of one output: the first and the last of their rows, and which output.
 Pair: TypeAlias = tuple[int, int, int]
 

@@ -28,7 +28,6 @@ LARGEST_TURN = 0.05
 #: Eigenvalues above this, per second times dt, are those at infinity, up to rounding.
 INFINITE = 1e8
 
-
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 DEFAULT_STATE_SHARE = 0.01
 
@@ -64,7 +63,6 @@ OPTIONS = (
     "bounds",
     *AS_GIVEN,
 )
-
 
 #: Steps of the nominal run; where a plant leaves its nominal point for where its equations have no solution, so small a
 #: share of the steps to there, and the fewest that say anything.

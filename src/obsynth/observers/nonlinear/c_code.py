@@ -45,7 +45,6 @@ _HELPER = re.compile(r"^((?:const )?(?:casadi_real|casadi_int|double|int|void)\*
 #: A bound that is missed by less, in deviations of its state, is kept.
 BOUND_SLACK = 1e-7
 
-
 #: Tried in turn when the environment does not name one in ``CC``.
 COMPILERS = ("cc", "gcc", "clang")
 

@@ -158,7 +158,7 @@ class DAEObserver(DAESettings):
 
     def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = as_given(y, "y", f"y must be {counted(self.model.ny, 'number')} at k = {state.k}.")
-        # What can be wrong with plain numbers is an infinity: it is told below.
+        # What can be wrong with plain numbers is an infinity: it is reported below.
         if not (_is_plain(y, self.model.ny) and (all_finite(outputs) or not np.isinf(outputs).any())):
             outputs = measured_record(np.atleast_2d(outputs), self.model.ny)[0]
         if _is_plain(u, self.model.nu) and all_finite(np.asarray(u)):

@@ -30,7 +30,6 @@ Integration: TypeAlias = Literal["backward-euler", "radau"]
 
 _DEFINITE = ("R", "initial_parameter_covariance")
 
-
 #: Arrays that stay matrices when they have one column.
 MATRIX_SETTINGS = frozenset(
     {

@@ -28,7 +28,6 @@ _PENCIL = ("E.mtx", "A.mtx", "names.json")
 #: A rate or an imbalance (per unit) that the power flow's tolerance explains.
 _AT_REST = 1e-4
 
-
 #: Devices that a message lists.
 _LISTED_DEVICES = 12
 
@@ -205,8 +204,8 @@ def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
         own = [name.removesuffix(f" {device}") for name in known if name.endswith(f" {device}")]
         if not own:
             devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
-            shown = ", ".join(devices[:_LISTED_DEVICES]) + (", ..." if len(devices) > _LISTED_DEVICES else "")
-            raise SpecError(f"{what}: the network has no device {device!r}; it has {shown}.", path=what)
+            first_devices = ", ".join(devices[:_LISTED_DEVICES]) + (", ..." if len(devices) > _LISTED_DEVICES else "")
+            raise SpecError(f"{what}: the network has no device {device!r}; it has {first_devices}.", path=what)
         for variable in variables:
             if variable not in own:
                 raise SpecError(f"{what}: {device} has no variable {variable!r}; it has {', '.join(own)}.", path=what)

@@ -365,9 +365,9 @@ def _step(fields: Mapping[str, Any], dt: float | None, unit: float, source: Path
     return own
 
 
-def _per_second(given: Mapping[str, Any], unit: float, source: Path) -> dict[str, Any]:
+def _per_second(matrices: Mapping[str, Any], unit: float, source: Path) -> dict[str, Any]:
     """Return the matrices of ``E x' = A x + ...`` with the derivative in a unit of time of ``unit`` s, per second."""
-    noisy = [name for name in ("Bw",) if name in given and np.any(given[name])]
+    noisy = [name for name in ("Bw",) if name in matrices and np.any(matrices[name])]
     if noisy:
         raise SpecError(
             f"{source}: {noisy[0]} is the intensity of noise in a TimeUnit that is not the second: convert the model "
@@ -375,18 +375,18 @@ def _per_second(given: Mapping[str, Any], unit: float, source: Path) -> dict[str
             path=noisy[0],
         )
     dynamic = ("A", "B", "Bf", "Bd")
-    return {name: np.asarray(value) / unit if name in dynamic else value for name, value in given.items()}
+    return {name: np.asarray(value) / unit if name in dynamic else value for name, value in matrices.items()}
 
 
 def _labelled(
     fields: Mapping[str, Any],
     labels: Mapping[str, Any],
-    given: Mapping[str, Any],
+    matrices: Mapping[str, Any],
     wanted: Mapping[str, str],
     source: Path,
 ) -> Iterator[tuple[str, Any]]:
     """Yield names of signals with what a field says of each of them."""
-    counts = _signal_counts(given)
+    counts = _signal_counts(matrices)
     for (field, kind), prefix in zip(wanted.items(), "xuy", strict=True):
         values = np.ravel(_dense_value(fields[field])) if field in fields else np.zeros(0)
         if not values.size:
@@ -399,35 +399,35 @@ def _labelled(
         yield from zip(labels[kind] or [f"{prefix}{i + 1}" for i in range(counts[kind])], values, strict=True)
 
 
-def _signal_counts(given: Mapping[str, Any]) -> dict[str, int]:
+def _signal_counts(matrices: Mapping[str, Any]) -> dict[str, int]:
     """Return the numbers of states, inputs and outputs by the field that names them."""
     return {
-        "state_names": np.shape(given["A"])[-1],
-        "input_names": next((np.shape(given[name])[-1] for name in "BD" if name in given), 0),
-        "output_names": len(given["C"] if "C" in given else given["A"]),
+        "state_names": np.shape(matrices["A"])[-1],
+        "input_names": next((np.shape(matrices[name])[-1] for name in "BD" if name in matrices), 0),
+        "output_names": len(matrices["C"] if "C" in matrices else matrices["A"]),
     }
 
 
 def _point(
-    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], source: Path
+    fields: Mapping[str, Any], labels: Mapping[str, Any], matrices: Mapping[str, Any], source: Path
 ) -> dict[str, float]:
     """Return the operating point of states, inputs and outputs, as fields ``x0``, ``u0`` and ``y0`` have it."""
-    return {name: float(np.squeeze(value)) for name, value in _labelled(fields, labels, given, _POINTS, source)}
+    return {name: float(np.squeeze(value)) for name, value in _labelled(fields, labels, matrices, _POINTS, source)}
 
 
 def _units(
-    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], source: Path
+    fields: Mapping[str, Any], labels: Mapping[str, Any], matrices: Mapping[str, Any], source: Path
 ) -> dict[str, str]:
-    stated = _labelled(fields, labels, given, _UNIT_FIELDS, source)
+    stated = _labelled(fields, labels, matrices, _UNIT_FIELDS, source)
     units = {name: str(np.squeeze(cell)).strip() for name, cell in stated if np.size(cell)}
     return {name: unit for name, unit in units.items() if unit}
 
 
 def _delays(
-    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], unit: float, source: Path
+    fields: Mapping[str, Any], labels: Mapping[str, Any], matrices: Mapping[str, Any], unit: float, source: Path
 ) -> dict[str, float]:
     """Return delays in s by input or output; ``unit``: seconds in what the file counts them in, samples or TimeUnit."""
-    sizes = _signal_counts(given)
+    sizes = _signal_counts(matrices)
     delays: dict[str, float] = {}
     for (field, kind), prefix in zip(_DELAYS_OF.items(), "uy", strict=True):
         values = np.ravel(_numbers_in(fields[field])) if field in fields else np.zeros(0)

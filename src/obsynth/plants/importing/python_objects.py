@@ -227,14 +227,14 @@ def _is_improper(system: Any, signal: Any) -> bool:
     return any(len(row) > len(np.trim_zeros(np.atleast_1d(system.den), "f")) for row in rows)
 
 
-def _sampling_time(own: Any, given: float | None) -> float:
+def _sampling_time(own: Any, dt: float | None) -> float:
     """Return the sampling time: ``None`` is continuous, ``True`` unsaid; two that differ are refused."""
-    if own is True and given is None:
+    if own is True and dt is None:
         raise SpecError("The system is sampled, but has no sampling time: give dt in seconds.", path="dt")
     if own is None or own is True:
-        return 0.0 if given is None else given
-    if given is not None and given != own:
-        raise SpecError(f"dt is {given}, but the system has dt = {own}: leave dt out.", path="dt")
+        return 0.0 if dt is None else dt
+    if dt is not None and dt != own:
+        raise SpecError(f"dt is {dt}, but the system has dt = {own}: leave dt out.", path="dt")
     return float(own)
 
 

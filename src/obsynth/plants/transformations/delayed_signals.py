@@ -311,9 +311,9 @@ def _labels(source: DescriptorSystem, lags: _Lags) -> tuple[dict[str, dict[str, 
     waits += [
         (name, f"reading of {name}", wait) for name, (wait, _) in zip(source.output_names, lags.outputs, strict=True)
     ]
-    for name, shown, count in waits:
+    for name, signal, count in waits:
         for lag in range(1, count + 1):
-            names.append(f"{shown}, {lag} sample{'s' if lag > 1 else ''} ago")
+            names.append(f"{signal}, {lag} sample{'s' if lag > 1 else ''} ago")
             for label, values in labels.items():
                 if name in getattr(source, label):
                     values[names[-1]] = getattr(source, label)[name]

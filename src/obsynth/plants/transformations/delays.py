@@ -150,19 +150,19 @@ def require_no_delays(plant: Any, what: str) -> None:
         )
 
 
-def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
+def plant_and_recovery(source: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
     """Return the plant of a transformation with its way back, or a plant as it is; a stated way back goes first.
 
     Delays on samples become states."""
-    made = without_delays(given)
+    made = without_delays(source)
     if not isinstance(made, Transformation):
         return made, recovery
     if recovery is None:
         return made.plant, made.recovery
-    return made.plant, recovery if isinstance(given, Transformation) else recovery.then(made.recovery)
+    return made.plant, recovery if isinstance(source, Transformation) else recovery.then(made.recovery)
 
 
-def linear_plant(given: Any) -> DescriptorSystem:
+def linear_plant(source: Any) -> DescriptorSystem:
     """Return a linear plant, of a transformation the transformed one, with delays on samples as states.
 
     Raises
@@ -172,7 +172,7 @@ def linear_plant(given: Any) -> DescriptorSystem:
     PreconditionError
         It is continuous and has delays.
     """
-    plant = given.plant if isinstance(given, Transformation) else given
+    plant = source.plant if isinstance(source, Transformation) else source
     if isinstance(plant, DAEModel):
         raise SpecError(
             "This is for linear plants; of a plant of equations give the linear one that its spec makes with "

@@ -69,8 +69,8 @@ def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **
 def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
     """Return the model with the nominal values of a box, whose constants are parameters then."""
     constants, parameters = (
-        {name: box.constants[name].nominal if name in box.constants else value for name, value in given.items()}
-        for given in (model.constants, model.parameters)
+        {name: box.constants[name].nominal if name in box.constants else value for name, value in values.items()}
+        for values in (model.constants, model.parameters)
     )
     same = constants == dict(model.constants) and parameters == dict(model.parameters)
     return promoted(model if same else model.replace(constants=constants, parameters=parameters), box.names)

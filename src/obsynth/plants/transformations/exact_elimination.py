@@ -140,32 +140,32 @@ def _term_sizes(
 ) -> list[FloatArray]:
     """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs.
     ``inverses``: sizes of the inverses of ``coupling`` and ``moving``."""
-    (left, right), (take, across), (direct, shown) = constraints, equations, outputs
+    (left, right), (take, across), (direct, output) = constraints, equations, outputs
     solver, inverse = inverses
     dynamic = _sizes(take) @ _sizes(right)
     if not coupling.nrows():
         return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)]
     algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left) @ _sizes(right))))
     dynamic = dynamic + _sizes(take * across) @ algebraic
-    return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(shown) @ algebraic]
+    return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(output) @ algebraic]
 
 
 def rounded_once(
-    found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
+    elimination: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
     """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` instead of the pivots."""
     if dynamic is None:
         return (
-            {name: nearest_doubles(matrix) for name, matrix in found.matrices.items()},
-            {name: nearest_doubles(matrix) for name, matrix in found.recovery.items()},
-            dict(found.sizes),
+            {name: nearest_doubles(matrix) for name, matrix in elimination.matrices.items()},
+            {name: nearest_doubles(matrix) for name, matrix in elimination.recovery.items()},
+            dict(elimination.sizes),
         )
     e = written_matrix(plant.E)
-    rows = pivot_columns((picked_columns(e, found.pivots)).transpose())
+    rows = pivot_columns((picked_columns(e, elimination.pivots)).transpose())
     with flint.ctx.workprec(COORDINATE_BITS):
         # E dynamic z = E (unit vectors) z_rational
         change = flint.arb_mat(picked_rows(e * written_matrix(dynamic), rows)).solve(
-            flint.arb_mat(picked_rows(picked_columns(e, found.pivots), rows))
+            flint.arb_mat(picked_rows(picked_columns(e, elimination.pivots), rows))
         )
         back = change.inv()
 
@@ -180,9 +180,9 @@ def rounded_once(
             return _doubles(work)
 
         return (
-            {name: moved(name, matrix, recovery=False) for name, matrix in found.matrices.items()},
-            {name: moved(name, matrix, recovery=True) for name, matrix in found.recovery.items()},
-            _moved_sizes(found.sizes, np.abs(_doubles(change)), np.abs(_doubles(back))),
+            {name: moved(name, matrix, recovery=False) for name, matrix in elimination.matrices.items()},
+            {name: moved(name, matrix, recovery=True) for name, matrix in elimination.recovery.items()},
+            _moved_sizes(elimination.sizes, np.abs(_doubles(change)), np.abs(_doubles(back))),
         )
 
 

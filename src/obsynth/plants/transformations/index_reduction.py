@@ -200,8 +200,8 @@ def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
         orders.append(nearest_doubles(nilpotent * term))
     others = (dynamic, states, differentiated, c * differentiated)
     chosen = tuple(int(row) for row in pivot_columns(dynamic.transpose()))
-    a, b, seen, d, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
-    return _Split(a, b, seen, d, v, x, later, outputs, tuple(orders), chosen, exact)
+    a, b, c_reduced, d, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
+    return _Split(a, b, c_reduced, d, v, x, later, outputs, tuple(orders), chosen, exact)
 
 
 def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | None:
@@ -211,8 +211,8 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     signals = [getattr(plant, name) for _, name, _, _ in _SIGNALS]
     direct = np.hstack([getattr(plant, name) for _, _, name, _ in _SIGNALS])
     entering = units.rate * units.equations[:, None] * np.hstack(signals)
-    shown = units.outputs[:, None]
-    c = shown * plant.C * units.states
+    outputs = units.outputs[:, None]
+    c = outputs * plant.C * units.states
     shift = max(_SHIFTS, key=lambda point: float(np.linalg.svd(point * e - a, compute_uv=False)[-1]))
     pencil = shift * e - a
     moved = np.linalg.solve(pencil, e)
@@ -221,9 +221,9 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     image, nilpotent = left[:, :count], right[count:].T
     rows = sorted(int(row) for row in scipy.linalg.qr(image.T, mode="r", pivoting=True)[1][:count])
     dynamic = np.linalg.solve(image[rows].T, image.T).T
-    whole = np.hstack([dynamic, nilpotent])
-    inner = np.linalg.solve(whole, moved @ whole)
-    back = np.linalg.inv(whole)
+    basis = np.hstack([dynamic, nilpotent])
+    inner = np.linalg.solve(basis, moved @ basis)
+    back = np.linalg.inv(basis)
     driven = back @ np.linalg.solve(pencil, entering)
     terms = np.abs(back) @ np.abs(np.linalg.inv(pencil)) @ np.abs(entering)
     constrained = _but_small(driven[count:], terms[count:])
@@ -246,12 +246,12 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     return _Split(
         own * factor[:, None] / factor / units.rate,
         b * factor[:, None] / units.rate,
-        _but_small(c @ dynamic, np.abs(c) @ np.abs(dynamic)) / shown / factor,
-        _but_small(c @ states, np.abs(c) @ np.abs(states)) / shown + direct,
+        _but_small(c @ dynamic, np.abs(c) @ np.abs(dynamic)) / outputs / factor,
+        _but_small(c @ states, np.abs(c) @ np.abs(states)) / outputs + direct,
         v * _but_small(dynamic, np.ones_like(dynamic)) / factor,
         v * states,
         v * differentiated,
-        _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)) / shown,
+        _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)) / outputs,
         tuple(orders),
         tuple(rows),
         None,
@@ -313,8 +313,8 @@ def _transformation(plant: DescriptorSystem, split: _Split) -> Transformation:
     matrices = {"A": split.A, "C": split.C}
     matrices |= dict(zip(("B", "Bf", "Bd", "Bw"), parts(split.B), strict=True))
     matrices |= dict(zip(("D", "Df", "Dd", "Dw"), parts(split.D), strict=True))
-    whole = not split.X[list(split.chosen)].any()
-    names = [plant.state_names[i] for i in split.chosen] if whole else [f"xi {i + 1}" for i in range(count)]
+    own_states = not split.X[list(split.chosen)].any()
+    names = [plant.state_names[i] for i in split.chosen] if own_states else [f"xi {i + 1}" for i in range(count)]
     new = with_states(
         plant,
         names,

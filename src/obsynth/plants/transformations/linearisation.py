@@ -170,9 +170,9 @@ def linearise(
        moving point we keep E x' as an input, which is exact to first order.
     """
     values, freed = dict(given or {}), _names(free, "free")
-    asked = scheduled_names(model, region, scheduling, constants=constants, drift=drift)
-    if asked:
-        model, values = at_scheduling(model, asked, values)
+    parameters = scheduled_names(model, region, scheduling, constants=constants, drift=drift)
+    if parameters:
+        model, values = at_scheduling(model, parameters, values)
     for name, bounds in free.items() if isinstance(free, Mapping) else ():
         if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
             raise SpecError(f"free.{name} must be [low, high].", path=f"free.{name}")
@@ -199,11 +199,13 @@ def linearise(
                 f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
             )
         point = consistent_point(model, nominal_point(model, values), values)
-    if asked:
-        faults = unscheduled_faults(model, asked, faults, disturbances)
-    linear = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box, scheduled=asked)
+    if parameters:
+        faults = unscheduled_faults(model, parameters, faults, disturbances)
+    linear = linear_model(
+        model, point, faults=faults, disturbances=disturbances, drift=drift, box=box, scheduled=parameters
+    )
     linear = _with_noise(linear, model.equation_names, process_noise, sensor_noise)
-    return over_scheduling(linear, model, point, asked, faults or (), disturbances) if asked else linear
+    return over_scheduling(linear, model, point, parameters, faults or (), disturbances) if parameters else linear
 
 
 def _with_noise(
@@ -328,12 +330,12 @@ def _over_box(
     moving: bool,
 ) -> DescriptorSystem:
     """Return a linear model that knows the tolerances of its constants."""
-    entries, moved, shown = entries_in_constants(model, point, box, columns, moving=moving)
+    entries, moved, outputs = entries_in_constants(model, point, box, columns, moving=moving)
     shift = ""
-    if moved or shown:
+    if moved or outputs:
         shift = shift_name(linear)
         nu = linear.nu
-        for name, items in (("B", moved), ("D", shown)):
+        for name, items in (("B", moved), ("D", outputs)):
             if items:
                 entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in items)]
         linear = with_shift(linear, shift)

@@ -31,13 +31,13 @@ def scheduled_names(
         return {}
     if isinstance(scheduling, str):
         raise SpecError(f"scheduling is the text {scheduling!r}: give a list of names.", path="scheduling")
-    asked = parameters_of(region)
-    names = list(asked) if scheduling is None else list(scheduling)
+    parameters = parameters_of(region)
+    names = list(parameters) if scheduling is None else list(scheduling)
     for name in names:
-        if name not in asked:
+        if name not in parameters:
             raise SpecError(f"scheduling has {name!r}, of which region gives no range.", path=f"region.{name}")
         _require_no_state(model, name)
-    idle = [name for name in asked if name not in names]
+    idle = [name for name in parameters if name not in names]
     if idle:
         raise SpecError(
             f"region has {idle[0]!r}, by which the model is not scheduled: name it in scheduling, or leave it out. A "
@@ -49,19 +49,19 @@ def scheduled_names(
             f"A model over a region has no {'constants' if constants is not None else 'drift'}: leave it out.",
             path="constants" if constants is not None else "drift",
         )
-    return {name: asked[name] for name in names}
+    return {name: parameters[name] for name in names}
 
 
 def at_scheduling(
-    model: DAEModel, asked: Mapping[str, Mapping[str, Any]], given: Mapping[str, float]
+    model: DAEModel, scheduling: Mapping[str, Mapping[str, Any]], given: Mapping[str, float]
 ) -> tuple[DAEModel, dict[str, float]]:
     """Return the model whose scheduled constants are parameters, and what is given with the scheduling at its nominal
     values, in the middle of its range where these are outside."""
-    promoted_model = promoted(model, tuple(asked))
+    promoted_model = promoted(model, tuple(scheduling))
     known = dict(zip(promoted_model.parameter_names, promoted_model.nominal_parameters.tolist(), strict=True))
     known |= dict(zip(model.input_names, model.nominal_input.tolist(), strict=True))
     values = dict(given)
-    for name, entry in asked.items():
+    for name, entry in scheduling.items():
         low, high = entry["range"]
         nominal = known[name] if low <= known[name] <= high else 0.5 * (low + high)
         values.setdefault(name, nominal)
@@ -69,11 +69,11 @@ def at_scheduling(
 
 
 def unscheduled_faults(
-    model: DAEModel, asked: Collection[str], faults: Sequence[str] | None, disturbances: Sequence[str]
+    model: DAEModel, scheduling: Collection[str], faults: Sequence[str] | None, disturbances: Sequence[str]
 ) -> list[str]:
     """Return the parameters that are faults: all that are not scheduled by default."""
-    chosen = [name for name in model.parameter_names if name not in asked] if faults is None else list(faults)
-    both = [name for name in (*chosen, *disturbances) if name in asked]
+    chosen = [name for name in model.parameter_names if name not in scheduling] if faults is None else list(faults)
+    both = [name for name in (*chosen, *disturbances) if name in scheduling]
     if both:
         kind = "a fault" if both[0] in chosen else "a disturbance"
         raise SpecError(f"{both[0]!r} is scheduled, and {kind}: choose one.", path=f"region.{both[0]}")
@@ -84,7 +84,7 @@ def over_scheduling(
     linear: DescriptorSystem,
     model: DAEModel,
     point: Point,
-    asked: Mapping[str, Mapping[str, Any]],
+    parameters: Mapping[str, Mapping[str, Any]],
     faults: Sequence[str],
     disturbances: Sequence[str],
 ) -> PolytopicSystem:
@@ -95,15 +95,17 @@ def over_scheduling(
     PreconditionError
         The equations are not linear beside the scheduling.
     """
-    require_linear_beside(model, tuple(asked), faults)
+    require_linear_beside(model, tuple(parameters), faults)
     unknown = [model.input_names.index(name) for name in disturbances]
     columns = {
-        "B": [i for i, name in enumerate(model.input_names) if i not in unknown and name not in asked],
+        "B": [i for i, name in enumerate(model.input_names) if i not in unknown and name not in parameters],
         "Bd": unknown,
         "Bf": [model.parameter_names.index(name) for name in faults],
     }
     at = dict(zip((*model.parameter_names, *model.input_names), (*point.theta, *point.u), strict=True))
-    entries, moved, shown = entries_in(model, point, {name: float(at[name]) for name in asked}, columns, moving=False)
+    entries, moved, shown = entries_in(
+        model, point, {name: float(at[name]) for name in parameters}, columns, moving=False
+    )
     shift = None
     if moved or shown:
         shift, place = shift_name(linear), linear.nu
@@ -117,7 +119,8 @@ def over_scheduling(
             rows[i][j] = text
         arguments[name] = rows
     scheduling = {
-        name: {**({"unit": model.units[name]} if name in model.units else {}), **entry} for name, entry in asked.items()
+        name: {**({"unit": model.units[name]} if name in model.units else {}), **entry}
+        for name, entry in parameters.items()
     }
     return PolytopicSystem(plant=arguments, scheduling=scheduling, shift=shift)
 

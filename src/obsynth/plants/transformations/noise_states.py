@@ -91,8 +91,8 @@ def with_noise(
     own = plant.plant if isinstance(plant, Transformation) else plant
     names = own.output_names
     sizes, shifts = (
-        numbers_in_units(given, own.units, kind, are_differences=True)
-        for kind, given in (("sensor_noise", sensor_noise), ("offset", offset))
+        numbers_in_units(stated, own.units, kind, are_differences=True)
+        for kind, stated in (("sensor_noise", sensor_noise), ("offset", offset))
     )
     noises = sensor_noises(sizes, names)
     offsets = _offsets(() if shifts is None else shifts, names, noises)
@@ -112,18 +112,18 @@ def with_noise(
     return _of_matrices(plant, noises, offsets, loads)
 
 
-def _intensities_by_equation(model: DAEModel, given: Mapping[str, float] | None) -> dict[str, float]:
+def _intensities_by_equation(model: DAEModel, intensities: Mapping[str, float] | None) -> dict[str, float]:
     """Return the intensity of white noise by equation."""
-    for name, value in (given or {}).items():
+    for name, value in (intensities or {}).items():
         index_of(name, model.equation_names, what="process_noise")
         real_number(value, f"process_noise.{name}", "an intensity above 0", above=0.0, path="process_noise")
-    return {name: float(value) for name, value in (given or {}).items()}
+    return {name: float(value) for name, value in (intensities or {}).items()}
 
 
-def _offsets(given: Any, names: Sequence[str], noises: Mapping[str, SensorNoise]) -> dict[str, tuple[float, float]]:
+def _offsets(offset: Any, names: Sequence[str], noises: Mapping[str, SensorNoise]) -> dict[str, tuple[float, float]]:
     """Return by output the deviation of its offset, and how far it walks: in the unit of a deviation."""
     offsets = {}
-    for name, value in (given if isinstance(given, Mapping) else dict.fromkeys(given, "unknown")).items():
+    for name, value in (offset if isinstance(offset, Mapping) else dict.fromkeys(offset, "unknown")).items():
         index_of(name, names, what="offset")
         size = noises[name].size if name in noises else 1.0
         deviation = OFFSET_SIZE * size if value == "unknown" else stated_number(value, f"offset.{name}")
@@ -149,12 +149,12 @@ def _of_matrices(
     drives = sizes * (np.sqrt(1.0 - kept**2) if own.is_discrete else np.sqrt(2.0 / times))
     keeps = np.concatenate([kept, np.full(len(offsets) + len(loads), 1.0 if own.is_discrete else 0.0)])
     driven = np.concatenate([drives, [walk for _, walk in offsets.values()], list(loads.values())])
-    dynamics, shown = np.zeros((nx, count)), np.zeros((ny, count))
+    dynamics, outputs = np.zeros((nx, count)), np.zeros((ny, count))
     for column, name in enumerate((*coloured, *offsets)):
-        shown[own.output_names.index(name), column] = 1.0
+        outputs[own.output_names.index(name), column] = 1.0
     moved, left = _columns_of(own, loads)
     for column, (matrix, direct, i) in enumerate(moved, len(coloured) + len(offsets)):
-        dynamics[:, column], shown[:, column] = getattr(own, matrix)[:, i], getattr(own, direct)[:, i]
+        dynamics[:, column], outputs[:, column] = getattr(own, matrix)[:, i], getattr(own, direct)[:, i]
 
     def below(matrix: FloatArray) -> FloatArray:
         return np.vstack([matrix, np.zeros((count, matrix.shape[1]))])
@@ -165,7 +165,7 @@ def _of_matrices(
     new = own.replace(
         E=E,
         A=A,
-        C=np.hstack([own.C, shown]),
+        C=np.hstack([own.C, outputs]),
         B=below(own.B),
         Bf=below(own.Bf[:, left["Bf"]]),
         Df=own.Df[:, left["Bf"]],

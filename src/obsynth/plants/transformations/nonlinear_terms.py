@@ -219,8 +219,8 @@ class _Registry:
         return translated if isinstance(translated, _Form) else _Form.number(translated)
 
     def _operation(self, operation: Callable[..., Any]) -> Callable[..., Any]:
-        def done(*given: Any) -> _Form:
-            forms = [part if isinstance(part, _Form) else _Form.number(part) for part in given]
+        def done(*operands: Any) -> _Form:
+            forms = [part if isinstance(part, _Form) else _Form.number(part) for part in operands]
             simple = self._linear(operation, forms)
             if simple is not None:
                 return simple

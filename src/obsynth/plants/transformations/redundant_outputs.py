@@ -56,8 +56,8 @@ def merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     """Return the plant with its dependent outputs merged; ``None`` where all are independent (or matrices sparse)."""
     if is_sparse(plant.C) or plant.ny == 0:
         return None
-    shown = np.hstack([plant.C, plant.Df, plant.Dd])
-    picked, q, exact = _independent(shown)
+    output_rows = np.hstack([plant.C, plant.Df, plant.Dd])
+    picked, q, exact = _independent(output_rows)
     if not picked or len(picked) == plant.ny:
         return None
     weights = _weights(q, plant.Dw)
@@ -81,19 +81,21 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
         return None
     # What is nearly dependent, and by how much a sensor counts without stated noise, is no matter of units.
     own = PlantUnits.of(plant)
-    shown = own.outputs[:, None] * np.hstack([plant.C * own.states, plant.Df * own.faults, plant.Dd * own.disturbances])
-    lengths = np.linalg.norm(shown, axis=1)
+    scaled = own.outputs[:, None] * np.hstack(
+        [plant.C * own.states, plant.Df * own.faults, plant.Dd * own.disturbances]
+    )
+    lengths = np.linalg.norm(scaled, axis=1)
     moving = np.flatnonzero(lengths)
     if not len(moving):
         return None
-    units = shown[moving] / lengths[moving, None]
+    units = scaled[moving] / lengths[moving, None]
     values = np.linalg.svd(units, compute_uv=False)
     count = int(np.sum(values > NEARLY_DEPENDENT * values[0]))
     if count == rounding_rank(units):
         return None
     picked = [int(moving[place]) for place in _most_independent(units, count)]
-    combinations = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
-    q = np.zeros((len(shown), count))
+    combinations = np.linalg.lstsq((scaled[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
+    q = np.zeros((len(scaled), count))
     q[moving] = combinations * lengths[moving, None] / lengths[picked]
     weights = _weights(q, own.outputs[:, None] * plant.Dw) * own.outputs / own.outputs[picked, None]
     merged = {name: weights @ getattr(plant, name) for name in ("C", "D", "Df", "Dd", "Dw")}
@@ -101,21 +103,21 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     return MergedOutputs(plant.replace(**merged, output_names=names), read_only(weights), False)
 
 
-def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
+def _independent(output_rows: FloatArray) -> tuple[list[int], FloatArray, bool]:
     """Return independent rows, the first ones where the numbers as written say which; Q: all rows from these; whether
     the numbers as written have this rank.  Rows that differ by rounding (a copy in another unit) depend on each
     other."""
-    lengths = np.linalg.norm(shown, axis=1)
+    lengths = np.linalg.norm(output_rows, axis=1)
     moving = np.flatnonzero(lengths)
-    units = shown[moving] / lengths[moving, None]
+    units = output_rows[moving] / lengths[moving, None]
     count = rounding_rank(units) if len(moving) else 0
-    picked = pivot_columns(written_matrix(shown).transpose()) if count else []
+    picked = pivot_columns(written_matrix(output_rows).transpose()) if count else []
     exact = len(picked) == count
     if not exact:
         picked = [int(moving[place]) for place in _first_independent(units, count)]
-    q = np.zeros((len(shown), count))
+    q = np.zeros((len(output_rows), count))
     if count:
-        unit_rows = shown[picked] / lengths[picked, None]
+        unit_rows = output_rows[picked] / lengths[picked, None]
         combinations = np.linalg.lstsq(unit_rows.T, units.T, rcond=None)[0].T
         q[moving] = but_rounding(combinations, np.ones_like(combinations)) * lengths[moving, None] / lengths[picked]
         q[picked] = np.eye(count)

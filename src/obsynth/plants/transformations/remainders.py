@@ -188,10 +188,10 @@ def _remainders(
     # E x' = -F(0, x, u, theta), of which the linear model has A, B, Bf and Bd.
     into = np.hstack([linear.A, linear.B, linear.Bf, linear.Bd])
     out = np.hstack([linear.C, linear.D, linear.Df, linear.Dd])
-    shown = np.array([linear.operating_point.get(name, 0.0) for name in linear.output_names])
+    point = np.array([linear.operating_point.get(name, 0.0) for name in linear.output_names])
     equations = [_missed(-value, row, 0.0, middles, halves) for value, row in zip(left, into, strict=True)]
     rates = [COEFFICIENT_ROUNDINGS * UNIT_ROUNDOFF * value.magnitude for value in left]
-    outputs = [_missed(value, row, y, middles, halves) for value, row, y in zip(output_values, out, shown, strict=True)]
+    outputs = [_missed(value, row, y, middles, halves) for value, row, y in zip(output_values, out, point, strict=True)]
     return np.array(equations) + np.array(rates), np.array(outputs)
 
 
@@ -233,9 +233,9 @@ def _sampled(
     return dict(zip(remainder_names(shipped), bounds.tolist(), strict=True))
 
 
-def _away(found: AffineMatrix, shipped: FloatArray) -> FloatArray:
+def _away(enclosure: AffineMatrix, shipped: FloatArray) -> FloatArray:
     """Return how far a proved matrix is from a shipped one at most."""
-    return rounded_up(np.abs(found.center - shipped) + found.radius + UNIT_ROUNDOFF * np.abs(shipped), 4)
+    return rounded_up(np.abs(enclosure.center - shipped) + enclosure.radius + UNIT_ROUNDOFF * np.abs(shipped), 4)
 
 
 def _moving(a: AffineMatrix, sizes: FloatArray, step: float) -> FloatArray:

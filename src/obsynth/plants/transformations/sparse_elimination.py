@@ -58,16 +58,16 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> Transformation | None:
     solved, backward = factor.solve_with_error(right.toarray())
     solved[:, count:] = without_rounding(factor, solved[:, count:])
     solution = -solved
-    kept = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
+    dynamics = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
     mass = sparse_factor(dynamic_rows @ csr(plant.E) @ dynamic)
     moved, backward_of_e = mass.solve_with_error(
-        product_but_rounding(csr(dynamic_rows @ a @ algebraic), solution, kept)
+        product_but_rounding(csr(dynamic_rows @ a @ algebraic), solution, dynamics)
     )
     direct = np.hstack([(c @ dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
-    shown = product_but_rounding(csr(c @ algebraic), solution, direct)
+    outputs = product_but_rounding(csr(c @ algebraic), solution, direct)
     ends = np.cumsum(counts)[:-1]
     matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
-    matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
+    matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(outputs, ends, axis=1), strict=True))
     operator = RecoveryOperator(dynamic, algebraic, inner, right, counts)
     recovery = StateRecovery.from_operator(plant.state_names, operator, np.eye(plant.nw), state_point(plant))
     bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))

@@ -391,8 +391,8 @@ def plot_residuals(
     time, size = dt * np.arange(steps), np.linalg.norm(estimates.residuals, axis=1)
     if positive := bool(np.any(size > 0.0)):
         panel.set_yscale("log")
-    shown = np.where(size > 0.0, size, np.nan) if positive else size
-    panel.plot(time, shown, label="norm of the residual", **RESIDUAL_STYLE)
+    values = np.where(size > 0.0, size, np.nan) if positive else size
+    panel.plot(time, values, label="norm of the residual", **RESIDUAL_STYLE)
     for (name, curve), style, marker in zip(curves.items(), THRESHOLD_STYLES, CROSSING_MARKERS, strict=False):
         panel.plot(time, curve, label=name, **style)
         crossed = np.flatnonzero(size > curve)

@@ -202,9 +202,9 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(test.fault_names, "-")
     sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
     largest = max(sizes.values())
-    shown = [name for name in courses if sizes[name] > ROUNDED_COURSE * largest]
+    drawn_names = [name for name in courses if sizes[name] > ROUNDED_COURSE * largest]
     # Faults first, then disturbances, then states.
-    for i, name in enumerate(sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":")))):
+    for i, name in enumerate(sorted(drawn_names, key=lambda name: ("-", "--", ":").index(styles.get(name, ":")))):
         style, unit = styles.get(name, ":"), plant.units.get(name, "")
         panel.plot(
             np.arange(len(courses[name])) * test.observer.dt,

@@ -72,10 +72,8 @@ LABEL_LETTERS = 24
 #: Letters of small print that fit in an inch, and those that the sample of a line takes.
 LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
 
-
 #: From this ratio of largest to smallest on, an axis is logarithmic.
 WIDE_AXIS = 10.0
-
 
 #: Up to this ratio of largest to smallest, a logarithmic axis has plain numbers.
 SHORT_SPREAD = 300.0
@@ -87,10 +85,10 @@ UNLIKE_RANGES = 100.0
 def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
     """Return ``count`` axes: the given ones, or new ones one above the other."""
     if axes is not None:
-        given = list(np.ravel(np.asarray(axes, dtype=object)))
-        if len(given) != count:
-            raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
-        return given
+        panels = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(panels) != count:
+            raise SpecError(f"{len(panels)} axes were given, but {count} are needed.", path="axes")
+        return panels
     return new_figure(count, size=size)[1] if count else []
 
 
@@ -109,24 +107,26 @@ def new_figure(
         figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
         height_ratios=heights,
     )
+    figure.align_ylabels(grid[:, 0])
     return figure, list(grid[:, 0])
 
 
 def image_of(
     count: int, draw: Callable[[list[Axes]], Any], *, size: tuple[float, float] | None = None, kind: str = "png"
 ) -> bytes:
-    """Return a picture of panels one above the other as it stands in a file; ``draw`` fills them, without a window."""
+    """Return the bytes of a picture of panels one above the other; ``draw`` fills them, without a window."""
     from matplotlib.figure import Figure
 
-    shown = max(count, 1)
-    figure = Figure(figsize=size or (WIDTH, PANEL_HEIGHT * shown + 0.6), layout="constrained")
-    axes = list(figure.subplots(shown, 1, sharex=True, squeeze=False)[:, 0])
+    panels = max(count, 1)
+    figure = Figure(figsize=size or (WIDTH, PANEL_HEIGHT * panels + 0.6), layout="constrained")
+    axes = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    figure.align_ylabels(axes)
     draw(axes[:count])
     return written(figure, kind=kind)
 
 
 def written(figure: Figure, *, kind: str = "png") -> bytes:
-    """Return a figure as it stands in a file."""
+    """Return the bytes of a figure's file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     for panel in figure.axes:
@@ -283,17 +283,17 @@ def plain_decades(panel: Axes, *, across: bool = False) -> None:
 
     lines = [np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()]
     # Across, a level that is drawn from one side to the other has no place.
-    shown = np.array(panel.dataLim.intervalx) if across else np.concatenate([np.zeros(0), *lines])
-    shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    if not shown.size:
+    values = np.array(panel.dataLim.intervalx) if across else np.concatenate([np.zeros(0), *lines])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    if not values.size:
         return  # nothing has a place on it, and matplotlib gives an axis without data limits below zero
     (panel.set_xscale if across else panel.set_yscale)("log")
-    if shown.max() > SHORT_SPREAD * shown.min():
+    if values.max() > SHORT_SPREAD * values.min():
         return
     axis = panel.xaxis if across else panel.yaxis
     if not across:
         steps = np.ravel(np.outer(10.0 ** np.arange(-15, 16), (1.0, 2.0, 5.0)))
-        below, above = steps[steps < shown.min()], steps[steps > shown.max()]
+        below, above = steps[steps < values.min()], steps[steps > values.max()]
         panel.set_ylim(below[-1] if below.size else None, above[0] if above.size else None)
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

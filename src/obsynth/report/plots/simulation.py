@@ -38,7 +38,6 @@ _DECISION_LABELS = {
 #: Values below this share of the threshold say nothing, and would stretch a logarithmic axis.
 LEAST_SHARE = 1e-3
 
-
 #: Of each kind of monitor: its statistic on the vertical axis, and its threshold.
 _DETECTIONS = {
     "paper": ("norm of r", "(66): not a pointwise bound"),
@@ -107,10 +106,10 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     """
     panel = one_panel(axes)
     time = dt * np.arange(len(decision.values))
-    shown = np.isfinite(decision.thresholds)
-    floor = LEAST_SHARE * float(np.min(decision.thresholds[shown], initial=1.0))
+    has_threshold = np.isfinite(decision.thresholds)
+    floor = LEAST_SHARE * float(np.min(decision.thresholds[has_threshold], initial=1.0))
     panel.plot(time, np.maximum(decision.values, floor), label=decision.statistic, **RESIDUAL_STYLE)
-    panel.plot(time[shown], decision.thresholds[shown], label="threshold", **THRESHOLD_STYLES[0])
+    panel.plot(time[has_threshold], decision.thresholds[has_threshold], label="threshold", **THRESHOLD_STYLES[0])
     panel.set_yscale("log")
     alarm = decision.alarm
     if alarm is not None:
@@ -241,15 +240,15 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     panel = one_panel(axes)
     time = dt * np.arange(len(detection.values))
     deciding = np.isfinite(detection.threshold) & (detection.threshold > 0.0)
-    shown = np.where(detection.values > 0.0, detection.values, np.nan)
+    values = np.where(detection.values > 0.0, detection.values, np.nan)
     label, threshold = _DETECTIONS[detection.kind]
-    panel.plot(time, shown, label="residual" if "norm" in label else "statistic", **RESIDUAL_STYLE)
+    panel.plot(time, values, label="residual" if "norm" in label else "statistic", **RESIDUAL_STYLE)
     panel.plot(time, np.where(deciding, detection.threshold, np.nan), label=threshold, **THRESHOLD_STYLES[0])
-    if np.any(~np.isnan(shown)):
+    if np.any(~np.isnan(values)):
         panel.set_yscale("log")
         if deciding.any():
             # An adaptive threshold may begin next to zero, one without disturbances ends there: at rounding level.
-            usual, most = float(np.median(detection.threshold[deciding])), float(np.nanmax(shown))
+            usual, most = float(np.median(detection.threshold[deciding])), float(np.nanmax(values))
             least = max(usual * 10.0**-DECADES_BELOW, float(np.finfo(np.float64).eps) * most)
             panel.set_ylim(least, ROOM_ABOVE * max(most, usual))
     if detection.k is not None:

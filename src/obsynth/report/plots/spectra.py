@@ -132,16 +132,16 @@ def _discrete_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> Non
 
 def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> None:
     axes.axvline(0.0, label="limit of stability", **_LIMIT)
-    shown = np.concatenate([poles, zeros])
+    points = np.concatenate([poles, zeros])
     for values, scale, limits in (
-        (shown.real, axes.set_xscale, axes.set_xlim),
-        (shown.imag, axes.set_yscale, axes.set_ylim),
+        (points.real, axes.set_xscale, axes.set_xlim),
+        (points.imag, axes.set_yscale, axes.set_ylim),
     ):
         sizes = np.abs(values)
-        alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(shown), initial=0.0)]
+        alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(points), initial=0.0)]
         if not alive.size:
             # As wide as the other axis: a damping grid in a flat picture would be one line.
-            reach = 0.5 * float(np.max(np.abs(shown), initial=0.0)) or 1.0
+            reach = 0.5 * float(np.max(np.abs(points), initial=0.0)) or 1.0
             limits(-reach, reach)
         elif alive.max() > WIDE_RATES * alive.min():
             scale("symlog", linthresh=float(alive.min()))

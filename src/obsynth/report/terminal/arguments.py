@@ -16,10 +16,8 @@ _ITEM = re.compile(r"  (\S.{0,12}? {2,})?(?=\S)")
 #: How far the rest of an item without a name hangs, and the widest lines of help texts.
 _HANGING, _WIDEST_HELP = 6, 110
 
-
 #: In place of a file: standard input, or standard output.
 STREAM = "-"
-
 
 #: Arguments of the command line that are not called as the options that they give.
 OPTION_NAMES = {

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from obsynth.specs.loader import Spec
 
 
-#: Constants of a gain set that differ from those of a spec and are told.
+#: Constants of a gain set that differ from those of a spec and are reported.
 MOST_TOLD_CONSTANTS = 4
 
 

@@ -23,7 +23,6 @@ from obsynth.specs.documents import read_yaml
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
 
-
 #: More designs than these are made on all processors: a process takes as long to begin as several small designs.
 FEW_DESIGNS = 10
 

@@ -37,7 +37,7 @@ class AdaptiveBound:
     responses: Responses
     varying: bool
     drive: FloatArray  # ``(p, nz + rows + no, nv)``: constants to eps, channel rows and outputs
-    shown: FloatArray  # ``(rows + no, nz)``: eps to channel rows and outputs
+    output_rows: FloatArray  # ``(rows + no, nz)``: eps to channel rows and outputs
     kernels: FloatArray  # ``(L w, m + no + nz)``, oldest first: ring to channels, outputs and eps
     same: FloatArray  # ``(w, m + no)``: the same at one sample
     solved: FloatArray  # for the loop of the channels at one sample
@@ -74,8 +74,10 @@ class AdaptiveBound:
         nz = self.counts[1]
         powers = self.responses.powers[:-1][::-1]
         inner = self.drive[:, :nz]
-        shown = np.concatenate([np.broadcast_to(self.shown, (len(powers), *self.shown.shape)) @ powers, powers], axis=1)
-        return np.asarray(np.einsum("jrz,pzv->jprv", shown, inner))
+        output_rows = np.concatenate(
+            [np.broadcast_to(self.output_rows, (len(powers), *self.output_rows.shape)) @ powers, powers], axis=1
+        )
+        return np.asarray(np.einsum("jrz,pzv->jprv", output_rows, inner))
 
     @cached_property
     def tail_rows(self) -> FloatArray:
@@ -173,7 +175,7 @@ def adaptive_bound(
         responses=responses,
         varying=varying,
         drive=drive,
-        shown=np.vstack([rows @ structure.Cx, structure.Co]),
+        output_rows=np.vstack([rows @ structure.Cx, structure.Co]),
         kernels=kernels,
         same=np.ascontiguousarray(same.T),
         solved=solved,

@@ -177,7 +177,7 @@ def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Fir
     for k in range(count):
         psi[:, k] = now
         now = (now.reshape(-1, nz) @ turned).reshape(runs, p, nz) + w[:, k, :, :nz]
-    responses = (psi.reshape(-1, nz) @ bound.shown.T).reshape(runs, count, p, rows + no)
+    responses = (psi.reshape(-1, nz) @ bound.output_rows.T).reshape(runs, count, p, rows + no)
     responses += w[..., nz:]
     sizes, offsets = np.abs(responses), bound.structure.offsets
     moved, shift = sizes[..., :rows].sum(axis=-2), np.zeros((runs, count, no))

@@ -228,13 +228,13 @@ def _picked_rows(
 ) -> FloatArray:
     """Return which rows of the observer's output are read ``(n + nf + watched, rows)``: its states, through
     ``reading``; with ``faults`` all of these; then what is watched."""
-    n, shown = len(back), observer.fault_rows
-    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
+    n, fault_rows = len(back), observer.fault_rows
+    watched = list(range(n) if states else range(fault_rows.start, fault_rows.stop if faults else len(observer.Cz)))
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
     picked[:n, observer.state_rows] = reading
     if faults:
         _require_every_fault(observer, nf)
-        picked[n : n + nf, shown] = np.eye(nf)
+        picked[n : n + nf, fault_rows] = np.eye(nf)
     picked[n + nf :, watched] = back if states else np.eye(len(watched))
     return picked
 

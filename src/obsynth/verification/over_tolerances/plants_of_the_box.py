@@ -29,11 +29,10 @@ MOST_VERTICES = 32
 MOST_GAIN_SAMPLES = 5_000
 
 #: What is left of a response when its sum ends.
-_GAIN_LEFT = 1e-6
+_GAIN_REMAINDER = 1e-6
 
 #: Samples that are taken at once.
 _GAIN_BLOCK = 50
-
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
@@ -105,20 +104,22 @@ def _peak_gain(
     observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
 ) -> FloatArray:
     """Return the peak gain of plant and error in series, without states that reach neither error nor outputs."""
-    shown = slice(observer.fault_rows.start, len(observer.Cz))
+    estimates = slice(observer.fault_rows.start, len(observer.Cz))
     try:
         smooth = eliminate_algebraic_states(plant).plant
     except ObsynthError:
         return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
     back = 2.0 * np.eye(len(basis)) - basis
     into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
-    through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
+    through = observer.Cz[estimates] @ followed + observer.Dy[estimates] @ smooth.C
     rows = np.vstack([back @ smooth.A, into, through])
     terms = np.concatenate(
         [
             np.abs(back @ smooth.A).sum(axis=1),
             (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
-            (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
+            (np.abs(observer.Cz[estimates]) @ np.abs(followed) + np.abs(observer.Dy[estimates]) @ np.abs(smooth.C)).sum(
+                axis=1
+            ),
         ]
     )
     apart = untouched_states(rows @ basis, terms)
@@ -131,8 +132,8 @@ def _peak_gain(
         ]
     )
     b = np.vstack([(back @ smooth.Bd)[states], observer.By @ smooth.Dd - followed @ smooth.Bd])
-    c = np.hstack([(through @ basis)[:, states], observer.Cz[shown]])
-    total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
+    c = np.hstack([(through @ basis)[:, states], observer.Cz[estimates]])
+    total = np.abs(observer.Dy[estimates] @ smooth.Dd).sum(axis=1)
     if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
         return np.full(len(c), np.inf)
     return np.asarray(total + _summed_response(a, b, c))
@@ -144,7 +145,7 @@ def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     while len(powers) <= _GAIN_BLOCK:
         powers.append(a @ powers[-1])
     block, onwards = np.array(powers[:-1]), powers[-1]
-    column, left, total = b, _GAIN_LEFT * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
+    column, left, total = b, _GAIN_REMAINDER * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
     for _ in range(0, MOST_GAIN_SAMPLES, _GAIN_BLOCK):
         moved = block @ column
         sizes = np.abs(moved).max(axis=(1, 2), initial=0.0)
@@ -194,21 +195,21 @@ def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDes
     return design.replace(plant=changed), changed
 
 
-def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> DescriptorSystem:
+def _with_tolerances_of(plant: DescriptorSystem, source: DescriptorSystem) -> DescriptorSystem:
     """Return a plant with the tolerances of one that is the same but for these."""
     same = all(
-        getattr(plant, name).shape == getattr(given, name).shape
-        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_PLANT_ZERO)
+        getattr(plant, name).shape == getattr(source, name).shape
+        and np.allclose(getattr(plant, name), getattr(source, name), rtol=SAME_ENTRY, atol=SAME_PLANT_ZERO)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
-    own, other = plant.uncertainty, given.uncertainty
+    own, other = plant.uncertainty, source.uncertainty
     if not same and own is not None and other is not None and own.written is not None:
         # The design is for a plant that was made from the one that is given.
-        before = as_written(given, other)
+        before = as_written(source, other)
         if dict(own.entries) == dict(other.entries) and all(
             np.array_equal(own.written[name], before[name]) for name in own.written
         ):
             return plant.replace(uncertainty=own.with_box(other.box))
-    if not same or plant.dt != given.dt:
+    if not same or plant.dt != source.dt:
         raise SpecError("constants is another plant than the design's: its nominal matrices differ.", path="constants")
-    return plant.replace(uncertainty=given.uncertainty)
+    return plant.replace(uncertainty=source.uncertainty)

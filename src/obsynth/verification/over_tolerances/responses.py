@@ -22,7 +22,6 @@ SHORTEST_RING, LONGEST_RING = 8, 8192
 #: Sums of products of doubles are multiplied by this: more than rounding can take from them.
 OUTWARD = 1.0 + 1e-12
 
-
 #: The largest tolerance is found to this share.
 FACTOR_SHARE = 1e-3
 
@@ -69,10 +68,10 @@ class Responses:
 
     def absolute_gain(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """Return an upper bound of ``sum_j |left Az^j| right`` for a nonnegative ``right``."""
-        shown = np.abs(left @ self.powers[:-1]).sum(axis=0)
+        sums = np.abs(left @ self.powers[:-1]).sum(axis=0)
         size = np.abs(self.powers[:-1]).sum(axis=0)
         rounding = self.length * power_rounding(left, self.powers)
-        return np.asarray((shown + rounding + np.abs(left @ self.powers[-1]) @ self.repeated @ size) @ right * OUTWARD)
+        return np.asarray((sums + rounding + np.abs(left @ self.powers[-1]) @ self.repeated @ size) @ right * OUTWARD)
 
 
 def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
@@ -145,8 +144,8 @@ def responses_of(structure: ErrorStructure) -> Responses:
 def _plain(structure: ErrorStructure, left: FloatArray, powers: FloatArray) -> FloatArray:
     """Return ``|left Az^j b|`` (absolute values inside for remainders) for all j."""
     own, inner = len(structure.owner), structure.effects[structure.rows[0]]
-    shown, slack = left @ powers, power_rounding(left, powers)
-    sizes = np.concatenate([np.abs(shown @ inner[:, :own]), np.abs(shown) @ np.abs(inner[:, own:])], axis=2)
+    responses, slack = left @ powers, power_rounding(left, powers)
+    sizes = np.concatenate([np.abs(responses @ inner[:, :own]), np.abs(responses) @ np.abs(inner[:, own:])], axis=2)
     return np.asarray(sizes + slack @ np.abs(inner))
 
 

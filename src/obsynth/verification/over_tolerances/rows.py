@@ -56,7 +56,7 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
         missed = _family_difference(plant, uncertain)
         detail = ""
     except ObsynthError as error:
-        # No bound over the box exists: who asks for one is told so.  The nominal plant alone is compared.
+        # No bound over the box exists: who asks for one gets an error.  The nominal plant alone is compared.
         missed, detail = 0.0, f"no family over the box: {error}"
     yield upper_bound_check(
         "tolerances of the plant",

@@ -37,7 +37,6 @@ _NORM_OUTWARD = 1.0 + 1e-9
 #: What rounding takes from a product of matrices, beside its terms.
 _PRODUCT_ROUNDING = 1e-14
 
-
 #: What rounding may leave where a compressed row of E vanishes, beside the terms it is made of.
 VANISHING_SHARE = 1e-13
 

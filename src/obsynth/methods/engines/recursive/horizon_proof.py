@@ -29,7 +29,6 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 #: Of more states nothing is proved: work goes with their cube, and bounds grow with them.
 MOST_PROVED_STATES = 100
 
-
 _Stack = tuple[FloatArray, FloatArray]
 
 

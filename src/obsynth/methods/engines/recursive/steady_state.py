@@ -39,7 +39,7 @@ WIDEST = 0.1
 #: So many deviations are listed in a row.
 LISTED_DEVIATIONS = 6
 
-#: Both ends are told where the upper one is so many times the lower one.
+#: Both ends are reported where the upper one is so many times the lower one.
 BOTH_ENDS = 1.001
 
 
