@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,9 @@ def test_help_begins_with_the_example(name: str, capsys: pytest.CaptureFixture[s
         main([name, "--help"])
     text = capsys.readouterr().out
     assert text.index("example:") < text.index("options:")
+    printed = text[text.index("example:") + len("example:") :].lstrip().partition("\n\n")[0]
+    # A shell reads the lines as the one command.
+    assert shlex.split(printed.replace("\\\n", " ")) == shlex.split(EXAMPLES[name])
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])

@@ -68,6 +68,9 @@ exit codes:
   6  a check of the shipped gains failed
 """
 
+#: Characters of a command on one line of a help of 78 columns, without its margin, a blank, dashes and a backslash.
+WIDEST_COMMAND = 70
+
 #: Verbs whose help lists the methods that are installed.
 _VERBS_WITH_METHODS = ("design", "check", "compare")
 
@@ -140,7 +143,7 @@ def _parser(name: str, description: str) -> Parser:
 def _with_verb(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.set_defaults(verb=name)
     if name in EXAMPLES:
-        parser.description = f"{parser.description}\n\nexample:\n  {EXAMPLES[name]}"
+        parser.description = f"{parser.description}\n\nexample:\n  {_in_lines(EXAMPLES[name])}"
         parser.formatter_class = Folded
     add_arguments(parser, VERBS[name].arguments)
     if settings := settings_of(VERBS[name].arguments):
@@ -149,6 +152,18 @@ def _with_verb(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentP
         # Asked for only when the help is printed: other packages may have registered some.
         parser.format_help = lambda: _help_with_methods(parser)  # type: ignore[method-assign]
     return parser
+
+
+def _in_lines(command: str) -> str:
+    """Return a command on as many lines as it needs, each broken before an option, as a shell reads them."""
+    first, *others = command.split(" --")
+    lines = [first]
+    for part in others:
+        if len(lines[-1]) + len(part) <= WIDEST_COMMAND:
+            lines[-1] += f" --{part}"
+        else:
+            lines.append(f"    --{part}")
+    return " \\\n  ".join(lines)
 
 
 def _help_with_methods(parser: argparse.ArgumentParser) -> str:
