@@ -105,35 +105,35 @@ def _constant(model: ErrorModel, fault: int) -> FloatArray | None:
         return None
     still = model.Phi - np.eye(len(model.Phi)) * (model.observer.dt > 0.0)
     for place in np.flatnonzero(~still.any(axis=0)):
-        shown = model.Cw[:, place]
-        if shown[fault] != 0.0 and np.count_nonzero(shown) == 1:
-            return np.asarray(np.eye(len(still))[place] / shown[fault])
+        column = model.Cw[:, place]
+        if column[fault] != 0.0 and np.count_nonzero(column) == 1:
+            return np.asarray(np.eye(len(still))[place] / column[fault])
     return None
 
 
-def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int | None) -> Check | None:
+def constant_fault_row(faults: ConstantFaults, limit: float, printed_digits: int | None) -> Check | None:
     """Return the row on constant faults; ``None`` where nothing is claimed of any.
 
     ``limit``: what an estimate may miss, as a share of the fault."""
-    model = given.model
-    if not given.own:
+    model = faults.model
+    if not faults.own:
         return None
     if printed_digits is not None:
         limit = max(limit, PRINTED_SHARE)
     claim = "the estimate of a constant fault equals it in the end, up to this share"
     source = "stored numbers and plant together, outward rounded"
-    sizes, settles = _sizes(given), _settles(model, SLOWEST_SETTLING)
-    missed = _decided(given, _missed_together, sizes, limit)
+    sizes, settles = _sizes(faults), _settles(model, SLOWEST_SETTLING)
+    missed = _decided(faults, _missed_together, sizes, limit)
     detail = "of plant and observer together, in exact arithmetic"
     if missed is not None and missed <= limit and settles:
-        missed, detail = _as_it_runs(given, sizes, missed)
+        missed, detail = _as_it_runs(faults, sizes, missed)
         if not missed <= limit and _order(model) <= MOST_STATES_IN_BITS:
             # Bounds of double precision were below the limit one by one: those of more digits may be so together.
-            closely = _decided(given, _missed_together, sizes, limit, STEADY_BITS)
+            closely = _decided(faults, _missed_together, sizes, limit, STEADY_BITS)
             if closely is not None:
-                missed, detail = _as_it_runs(given, sizes, closely, STEADY_BITS)
+                missed, detail = _as_it_runs(faults, sizes, closely, STEADY_BITS)
     elif not settles:
-        alone = _decided(given, _missed_alone, sizes, limit)
+        alone = _decided(faults, _missed_alone, sizes, limit)
         if alone is not None and not (missed is not None and missed <= limit):
             missed, detail = alone, "of the errors alone, in exact arithmetic"
         detail += ": the plant's state does not settle with such a fault, and rounding as it runs is not counted"
@@ -158,18 +158,18 @@ def _tried_bits(given: ConstantFaults) -> tuple[int, ...]:
 
 
 def _decided(
-    given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float, tried: Sequence[int] | None = None
+    faults: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float, tried: Sequence[int] | None = None
 ) -> float | None:
     """Return a bound on the largest share that is missed, in as many digits as tell it from the limit."""
     value = None
-    for bits in _tried_bits(given) if tried is None else tried:
+    for bits in _tried_bits(faults) if tried is None else tried:
         miss: Ball | None
         if bits:
             with flint.ctx.workprec(bits):
-                exact = missed(given, ExtendedBall)
+                exact = missed(faults, ExtendedBall)
                 miss = None if exact is None else as_ball(exact.content)
         else:
-            miss = missed(given, Ball)
+            miss = missed(faults, Ball)
         if miss is None or not np.all(np.isfinite(miss.magnitude)):
             continue
         value = float(np.max(miss.magnitude * sizes, initial=0.0))
@@ -178,21 +178,21 @@ def _decided(
     return value
 
 
-def _sizes(given: ConstantFaults) -> FloatArray:
+def _sizes(faults: ConstantFaults) -> FloatArray:
     """Return how large one fault is beside another, ``(nf, columns)``: faults are as large as what they make of the
     outputs in their natural units."""
-    plant = given.model.plant
+    plant = faults.model.plant
     with np.errstate(all="ignore"):
         try:
             state = np.linalg.solve(_pencil(plant, _point(plant)), plant.Bf)
         except np.linalg.LinAlgError:
             state = np.zeros((plant.nx, plant.nf))
-        shown = np.abs(plant.C @ state + plant.Df) / natural_scaling(plant).outputs[:, None]
-        reach = np.max(shown, axis=0, initial=0.0)
+        outputs = np.abs(plant.C @ state + plant.Df) / natural_scaling(plant).outputs[:, None]
+        reach = np.max(outputs, axis=0, initial=0.0)
     usual = np.isfinite(reach) & (reach > 0.0)
     reach = np.where(usual, reach, 1.0) if usual.all() else np.ones(plant.nf)
-    rows = [plant.fault_names.index(name) for name in given.model.observer.fault_names]
-    return np.asarray(reach[rows][:, None] / reach[given.own][None, :])
+    rows = [plant.fault_names.index(name) for name in faults.model.observer.fault_names]
+    return np.asarray(reach[rows][:, None] / reach[faults.own][None, :])
 
 
 def _point(plant: DescriptorSystem) -> float:
@@ -203,17 +203,17 @@ def _pencil(plant: DescriptorSystem, point: float) -> FloatArray:
     return np.asarray(point * plant.E - plant.A)
 
 
-def _goal(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed:
+def _goal(faults: ConstantFaults, kind: type[Enclosed]) -> Enclosed:
     """Return what the estimates shall be, ``(nf, columns)``."""
-    return kind.exact(given.gain[:, np.all(np.isfinite(given.gain), axis=0)])
+    return kind.exact(faults.gain[:, np.all(np.isfinite(faults.gain), axis=0)])
 
 
-def _missed_together(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
+def _missed_together(faults: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the estimates of plant and observer together miss ``(nf, columns)``."""
-    settled = _settled(given, given.model.observer, kind)
+    settled = _settled(faults, faults.model.observer, kind)
     if settled is None:
         return None
-    missed: Enclosed = settled.estimates - _goal(given, kind)
+    missed: Enclosed = settled.estimates - _goal(faults, kind)
     return missed
 
 
@@ -225,9 +225,9 @@ class _Settled(NamedTuple):
     estimates: Any
 
 
-def _settled(given: ConstantFaults, observer: LinearObserver, kind: type[Enclosed]) -> _Settled | None:
+def _settled(faults: ConstantFaults, observer: LinearObserver, kind: type[Enclosed]) -> _Settled | None:
     """Return where plant and an observer settle; ``None`` where no such state is enclosed."""
-    plant, own, rows = given.model.plant, given.own, observer.fault_rows
+    plant, own, rows = faults.model.plant, faults.own, observer.fault_rows
     e, a, c = (kind.exact(part) for part in (plant.E, plant.A, plant.C))
     state = enclosed_solution(e - a if plant.dt > 0.0 else -a, kind.exact(plant.Bf[:, own]))
     if state is None:
@@ -237,30 +237,30 @@ def _settled(given: ConstantFaults, observer: LinearObserver, kind: type[Enclose
     if inner is None:
         return None
     states = _seen_by_faults(observer)
-    shown = kind.exact(observer.Cz[rows][:, states]) @ inner + kind.exact(observer.Dy[rows]) @ outputs
-    return _Settled(outputs, inner, shown)
+    estimates = kind.exact(observer.Cz[rows][:, states]) @ inner + kind.exact(observer.Dy[rows]) @ outputs
+    return _Settled(outputs, inner, estimates)
 
 
 def _as_it_runs(
-    given: ConstantFaults, sizes: FloatArray, missed: float, tried: Sequence[int] | None = None
+    faults: ConstantFaults, sizes: FloatArray, missed: float, tried: Sequence[int] | None = None
 ) -> tuple[float, str]:
     """Return what the estimates miss at most as the observer runs in double precision, and how that was found."""
     try:
-        observer = as_it_runs(given.model.observer)
+        observer = as_it_runs(faults.model.observer)
     except (ValueError, np.linalg.LinAlgError):  # Numbers that are none.
         return np.nan, "of plant and observer together: the observer cannot be sampled"
-    known = _magnitudes(given, observer, _tried_bits(given) if tried is None else tried)
+    known = _magnitudes(faults, observer, _tried_bits(faults) if tried is None else tried)
     if known is None:
         return np.nan, "of plant and observer together, in exact arithmetic: rounding as it runs is not enclosed"
     outputs, states, apart = known
     with np.errstate(all="ignore"):
         added = rounding_in_operation(observer, _seen_by_faults(observer), outputs, states)
         rounding = float(np.max((added + apart) * sizes, initial=0.0))
-    sampled = "" if given.model.observer.dt > 0.0 else f", sampled every {observer.dt:.3g} s"
+    sampled = "" if faults.model.observer.dt > 0.0 else f", sampled every {observer.dt:.3g} s"
     detail = (
         f"of plant and observer together: {missed:.2g} in exact arithmetic, and as it runs in double precision{sampled}"
     )
-    if not _settles(given.model, SLOWEST_COUNTED) or _settling_time(observer) > 1.0 / SLOWEST_COUNTED:
+    if not _settles(faults.model, SLOWEST_COUNTED) or _settling_time(observer) > 1.0 / SLOWEST_COUNTED:
         bound = f"adds at most {rounding:.2g}" if np.isfinite(rounding) else "has no proved bound"
         slow = "once plant and observer have settled, which takes so long (over 1e5 samples) that it is not counted"
         return missed, f"{detail}, rounding {bound} {slow}"
@@ -275,20 +275,20 @@ def _settling_time(observer: LinearObserver) -> float:
 
 
 def _magnitudes(
-    given: ConstantFaults, observer: LinearObserver, tried: Sequence[int]
+    faults: ConstantFaults, observer: LinearObserver, tried: Sequence[int]
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return bounds on the outputs, on the states and on what sampling changes of the estimates; ``None`` without."""
     known = None
     for bits in tried:
         kind: type[Any] = ExtendedBall if bits else Ball
         with flint.ctx.workprec(bits or STEADY_BITS[0]):
-            settled = _settled(given, observer, kind)
-            exact = settled if observer is given.model.observer else _settled(given, given.model.observer, kind)
+            settled = _settled(faults, observer, kind)
+            exact = settled if observer is faults.model.observer else _settled(faults, faults.model.observer, kind)
             if settled is None or exact is None:
                 continue
             parts: list[Any] = [settled.outputs, settled.states, settled.estimates - exact.estimates]
             balls = [part if isinstance(part, Ball) else as_ball(part.content) for part in parts]
-        if observer is given.model.observer:
+        if observer is faults.model.observer:
             balls[2] = Ball.exact(np.zeros(balls[2].midpoint.shape))
         outputs, states, apart = (ball.magnitude for ball in balls)
         if all(np.all(np.isfinite(size)) for size in (outputs, states, apart)):
@@ -303,14 +303,14 @@ def _is_narrow(ball: Ball) -> bool:
     return bool(np.all(ball.radius <= LARGEST_ENCLOSURE * np.max(np.abs(ball.midpoint), axis=0, initial=0.0)))
 
 
-def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
+def _missed_alone(faults: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the estimates miss where the plant's states meet the identities ``(nf, columns)``."""
-    model, own = given.model, given.own
+    model, own = faults.model, faults.own
     plant, observer, rows = model.plant, model.observer, model.observer.fault_rows
     bf, df, by, dy = (kind.exact(part) for part in (plant.Bf[:, own], plant.Df[:, own], observer.By, observer.Dy[rows]))
     if model.Phi is None:
         driven = by @ df - kind.exact(model.own) @ bf
-        direct = dy @ df - _goal(given, kind)
+        direct = dy @ df - _goal(faults, kind)
         if model.T0 is not None:
             direct = direct + kind.exact(model.T0[rows, : plant.nx]) @ bf
     else:
@@ -321,14 +321,14 @@ def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | Non
         ahead = kind.exact(model.T) @ (kind.exact(model.A) @ motion)
         outputs = kind.exact(model.C) @ motion
         driven = kind.exact(observer.Az) @ tracked + by @ outputs - ahead
-        direct = kind.exact(observer.Cz[rows]) @ tracked + dy @ outputs - _goal(given, kind)
+        direct = kind.exact(observer.Cz[rows]) @ tracked + dy @ outputs - _goal(faults, kind)
         if model.T0 is not None:
             direct = direct + kind.exact(model.T0[rows]) @ (kind.exact(model.A) @ motion)
-    shown = _shown(observer, driven, kind)
-    return None if shown is None else shown + direct
+    estimates = _settled_estimates(observer, driven, kind)
+    return None if estimates is None else estimates + direct
 
 
-def _shown(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
+def _settled_estimates(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the fault estimates show in the end of what drives the observer's state all the time."""
     state = _driven(observer, driven, kind)
     states = _seen_by_faults(observer)

@@ -71,25 +71,25 @@ FORGETTING_ROOM = 1.01
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
 
-def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, options: OptimalFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.optimal_filter` for the options, results and errors."""
-    if not is_auto(asked.delay) and not plant.is_discrete:
+    if not is_auto(options.delay) and not plant.is_discrete:
         raise SpecError(
             "A delay in samples is for discrete time: give a reference model.", path=f"{OPTIONS_PATH}.delay"
         )
     progress("checking the existence conditions")
-    require_all_conditions(asked.existence(plant))
-    plant = seen_plant(plant, asked.decoupled_names(plant))
+    require_all_conditions(options.existence(plant))
+    plant = seen_plant(plant, options.decoupled_names(plant))
     progress("searching the least gain")
     try:
-        curve, chosen = _chosen(plant, asked)
+        curve, chosen = _chosen(plant, options)
         progress("building the realisation and its certificate")
-        return _made(plant, asked, curve, chosen)
+        return _made(plant, options, curve, chosen)
     except (PreconditionError, SolverError):
         if with_lasting_modes_driven(plant) is plant:
             raise
     progress("searching the least gain with noise on modes that last")
-    return _with_every_start(plant, asked) if asked.norm == "h2" else _with_lasting_modes(plant, asked)
+    return _with_every_start(plant, options) if options.norm == "h2" else _with_lasting_modes(plant, options)
 
 
 def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
@@ -123,14 +123,14 @@ def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Sy
     return replace(made, notes=tuple(notes))
 
 
-def _with_lasting_modes(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
+def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis:
     """Return the filter for the largest noise on modes that last of which less does not lower the gain."""
     best, least_gain = None, math.inf
     for drive in ADDED_DRIVES:
         driven = with_lasting_modes_driven(plant, drive)
         try:
-            curve, chosen = _chosen(driven, asked)
-            made = _made(plant, asked, curve, chosen, searched=driven)
+            curve, chosen = _chosen(driven, options)
+            made = _made(plant, options, curve, chosen, searched=driven)
         except (PreconditionError, SolverError):
             # With less noise rounding may spoil the proof; the filter for more of it is proved already.
             if best is None:
@@ -146,22 +146,22 @@ def _with_lasting_modes(plant: DescriptorSystem, asked: OptimalFilterMethod) -> 
 
 
 def synthesis_of_gains(
-    plant: DescriptorSystem, asked: OptimalFilterMethod, fault_map: FaultMap, gains: Mapping[str, FloatArray]
+    plant: DescriptorSystem, options: OptimalFilterMethod, fault_map: FaultMap, gains: Mapping[str, FloatArray]
 ) -> Synthesis:
     """Return the filter of gains ``K`` and ``Z0`` on the innovation, beside the bounds on every filter."""
-    plant = seen_plant(plant, asked.decoupled_names(plant))
-    least = designed(plant, fault_map, asked.norm)
+    plant = seen_plant(plant, options.decoupled_names(plant))
+    least = designed(plant, fault_map, options.norm)
     white = whitened(least.problem)
     own = realised(least.problem, *white.restored(least.problem, gains["K"], gains["Z0"]), plant.ny)
     own = own if plant.is_discrete else uncayley(*own, least.problem.alpha)
-    gain = unit_of_gains(plant, fault_map) * achieved(white, gains["K"], gains["Z0"], asked.norm)
+    gain = unit_of_gains(plant, fault_map) * achieved(white, gains["K"], gains["Z0"], options.norm)
     chosen = least._replace(filter=filter_in_plant_units(plant, fault_map, own), gain=gain, least=least.gain)
-    return _made(plant, asked, [], chosen)
+    return _made(plant, options, [], chosen)
 
 
 def _made(
     plant: DescriptorSystem,
-    asked: OptimalFilterMethod,
+    method: OptimalFilterMethod,
     curve: list[_Row],
     chosen: Designed,
     *,
@@ -174,16 +174,16 @@ def _made(
     """
     fault_map = chosen.fault_map
     own = plant if searched is None else searched
-    chosen, follower, observer = _with_enough_noise(own, chosen, asked.norm)
+    chosen, follower, observer = _with_enough_noise(own, chosen, method.norm)
     full = observer.order
-    if asked.order_limit is not None and full > asked.order_limit:
-        chosen, follower, observer = _of_low_order(own, chosen, asked.order_limit, full, asked.norm)
+    if method.order_limit is not None and full > method.order_limit:
+        chosen, follower, observer = _of_low_order(own, chosen, method.order_limit, full, method.norm)
     if searched is not None:
-        own_map = on_plant(plant, fault_map, asked.weights)
+        own_map = on_plant(plant, fault_map, method.weights)
         chosen = chosen._replace(fault_map=own_map)
-        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, follower, observer, asked.norm))
+        chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, follower, observer, method.norm))
     chosen = chosen if least is None else chosen._replace(least=min(least, chosen.gain))
-    matrices, claims = certified(plant, chosen, observer, follower, asked.norm)
+    matrices, claims = certified(plant, chosen, observer, follower, method.norm)
     matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
     if reference is not None:
@@ -191,12 +191,12 @@ def _made(
     options: dict[str, Any] = {
         "delay": "auto" if fault_map.delays is None else plain_delays(fault_map.delays),
         "reference": None if reference is None else plain(reference),
-        "norm": asked.norm,
+        "norm": method.norm,
         "exact": fault_map.exact,
         "decoupled": [*plant.disturbance_names],
-        "weights": plain_weights(asked.weights, plant),
-        "order_limit": asked.order_limit,
-        "steady_error_limit": asked.steady_error_limit,
+        "weights": plain_weights(method.weights, plant),
+        "order_limit": method.order_limit,
+        "steady_error_limit": method.steady_error_limit,
     }
     solver = {
         "engine": "filtering Riccati equation",
@@ -204,10 +204,10 @@ def _made(
         "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
     gains = {"T": follower.T, "T0": follower.T0}
-    notes = tuple(_notes(plant, curve, chosen, asked, claims))
+    notes = tuple(_notes(plant, curve, chosen, method, claims))
     notes += (
         ()
-        if chosen.least is None or asked.order_limit is None
+        if chosen.least is None or method.order_limit is None
         else (_reduced_note(chosen, observer.order, full, claims),)
     )
     notes += () if searched is None else (LASTING_NOTE,)
@@ -310,18 +310,18 @@ class _Row(NamedTuple):
         return 0.0 if self.found.is_nothing else self.found.gain
 
 
-def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod, *, undriven: int = 0) -> tuple[list[_Row], Designed]:
+def _chosen(plant: DescriptorSystem, options: OptimalFilterMethod, *, undriven: int = 0) -> tuple[list[_Row], Designed]:
     """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none.
 
     ``undriven``: last columns of the noise that carry none.
     """
-    fault_map, _ = first_problem(plant, asked)
+    fault_map, _ = first_problem(plant, options)
     fault_map = fault_map._replace(undriven=undriven)
-    first = designed(plant, fault_map, asked.norm)
+    first = designed(plant, fault_map, options.norm)
     if fault_map.delays is None:
         return [], first
-    curve = [_row(plant, first, asked.norm)]
-    is_open = tuple(late is None for late in delays_of(asked.delay, plant))
+    curve = [_row(plant, first, options.norm)]
+    is_open = tuple(late is None for late in delays_of(options.delay, plant))
     # A delay that was asked for is printed with what one sample more would give.
     more, most = (MORE_DELAYS, MOST_MORE_DELAYS) if any(is_open) else (1, 1)
     which = is_open if any(is_open) else None
@@ -330,16 +330,18 @@ def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod, *, undriven: in
         if curve[-1].found.is_nothing or (len(curve) > more and not falling):
             break
         try:
-            curve.append(_row(plant, designed(plant, fault_map.later(samples, which=which), asked.norm), asked.norm))
+            curve.append(
+                _row(plant, designed(plant, fault_map.later(samples, which=which), options.norm), options.norm)
+            )
         except PreconditionError:
             break
     if not any(is_open):
         return curve, first
     enough = max(DELAY_ROOM * min(row.counts for row in curve), first.nothing)
     chosen = next(row.found for row in curve if row.found.gain <= enough)
-    if is_auto(asked.delay):
+    if is_auto(options.delay):
         return curve, chosen
-    return curve, _shortened(plant, chosen, is_open, enough, asked.norm)
+    return curve, _shortened(plant, chosen, is_open, enough, options.norm)
 
 
 def _shortened(
@@ -360,23 +362,23 @@ def _shortened(
     return chosen
 
 
-def _row(plant: DescriptorSystem, found: Designed, norm: str) -> _Row:
+def _row(plant: DescriptorSystem, filter_: Designed, norm: str) -> _Row:
     """Return the row of a filter, with the least of the norm that it is not for."""
-    if found.is_nothing:
-        return _Row(found, 0.0, 0.0)
-    other = designed(plant, found.fault_map, "h2" if norm == "hinf" else "hinf")
+    if filter_.is_nothing:
+        return _Row(filter_, 0.0, 0.0)
+    other = designed(plant, filter_.fault_map, "h2" if norm == "hinf" else "hinf")
     least = 0.0 if other.is_nothing else other.gain
-    return _Row(found, found.gain, least) if norm == "hinf" else _Row(found, least, found.gain)
+    return _Row(filter_, filter_.gain, least) if norm == "hinf" else _Row(filter_, least, filter_.gain)
 
 
 def _notes(
     plant: DescriptorSystem,
     curve: list[_Row],
     chosen: Designed,
-    asked: OptimalFilterMethod,
+    options: OptimalFilterMethod,
     claims: Mapping[str, float],
 ) -> list[str]:
-    notes = [_statement(curve, chosen, asked, claims)]
+    notes = [_statement(curve, chosen, options, claims)]
     if len(curve) > 1:
         listed = "; ".join(f"delay {_late(row)}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
         notes.append(f"Least gain, and least deviation for white noise of unit intensity, by delay: {listed}.")
@@ -384,16 +386,16 @@ def _notes(
         notes.append(
             "An output, or a combination of outputs, has no noise: the filter is the one for "
             f"{chosen.added_noise:g} of the plant's own sizes more on every output. "
-            + _gap(plant, chosen, asked, claims)
+            + _gap(plant, chosen, options, claims)
         )
-    if chosen.is_nothing and asked.norm == "hinf":
+    if chosen.is_nothing and options.norm == "hinf":
         notes.append(
             "The least gain is zero: with exact numbers nothing reaches the error; what is claimed is rounding."
         )
     return notes
 
 
-def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
+def _statement(curve: list[_Row], chosen: Designed, options: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
     """Return what no filter beats, how near this one is to it, and what more delay would give."""
     fault_map = chosen.fault_map
     if not fault_map.exact:
@@ -403,7 +405,7 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
     else:
         of = f"over all causal filters, linear or not, with this exact fault map and delay {in_words(fault_map.delays)}"
     of = of if fault_map.weights is None else f"{of}, of the weighted problem"
-    if asked.norm == "h2":
+    if options.norm == "h2":
         of = of.replace("causal filters, linear or not,", "causal linear filters")
         own, least = claims["deviation"], claims["least_deviation"]
         reached = "reached by this filter" if own == least else f"this filter: {own:.8g}"
@@ -432,10 +434,10 @@ def _late(row: _Row) -> str:
     return in_words(row.found.fault_map.delays or ())
 
 
-def _gap(plant: DescriptorSystem, chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
+def _gap(plant: DescriptorSystem, chosen: Designed, options: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
     """Return how far gain and least gain are apart, and which noise, that was tried, brings them together."""
     least, gain = claims.get("least", 0.0), claims.get("gain", 0.0)
-    if asked.norm == "h2" or chosen.is_nothing or chosen.least is not None:
+    if options.norm == "h2" or chosen.is_nothing or chosen.least is not None:
         return "State the noise of every sensor (sensor_noise)."
     text = f"The least gain is {(gain - least) / gain:.2g} of the gain below it"
     if gain - least <= CLOSED_GAP * gain:

@@ -233,9 +233,9 @@ class LogRun:
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         if self.later is None:
-            return self._shown(self.read(chunk))
+            return self._rows_out(self.read(chunk))
         # What waits for a row is smoothed by it before the next one is taken.
-        return self._shown(
+        return self._rows_out(
             [ready for row in chunk for took in self.read(row[None]) for ready, *_ in self.later.take(took)]
         )
 
@@ -336,9 +336,9 @@ class LogRun:
         """Return the rows of output that waited for what does not come any more."""
         if self.units is not None:
             self.units.finish()
-        return [] if self.later is None else self._shown([ready for ready, *_ in self.later.flush()])
+        return [] if self.later is None else self._rows_out([ready for ready, *_ in self.later.flush()])
 
-    def _shown(self, taken: Sequence[Row]) -> list[list[Any]]:
+    def _rows_out(self, taken: Sequence[Row]) -> list[list[Any]]:
         if not taken:
             return []
         estimates = [row.values for row in taken]

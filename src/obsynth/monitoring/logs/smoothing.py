@@ -61,7 +61,7 @@ class LaterRows:
         if self.lag is None:
             return
         while (k := self.waiting[0][1]) + self.lag <= chain.last:
-            yield self._shown(*self.waiting.pop(0), chain.smoothed(k, k + self.lag)[0])
+            yield self._smoothed_row(*self.waiting.pop(0), chain.smoothed(k, k + self.lag)[0])
         # A late value changes what is known since its own time.
         chain.drop_before(min(k, chain.last - self.logged.observer.timing.longest))
 
@@ -73,9 +73,9 @@ class LaterRows:
         first = waiting[0][1]
         smoothed = self.chain.smoothed(first, waiting[-1][1])
         for row, k in waiting:
-            yield self._shown(row, k, smoothed[k - first])
+            yield self._smoothed_row(row, k, smoothed[k - first])
 
-    def _shown(self, row: Row, k: int, smoothed: Smoothed) -> tuple[Row, Any, Smoothed]:
+    def _smoothed_row(self, row: Row, k: int, smoothed: Smoothed) -> tuple[Row, Any, Smoothed]:
         nx = len(self.logged.state_names)
         if row.status in STALE:
             return row, self.chain.row(k), smoothed
