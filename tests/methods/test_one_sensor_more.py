@@ -121,3 +121,23 @@ def deviation_of(design: obsynth.ObserverDesign) -> float:
     steady = scipy.linalg.solve_discrete_lyapunov(run.Az, noise @ noise.T)
     direct, row = 0.1 * run.Dy[run.fault_rows], run.Cz[run.fault_rows]
     return float(np.sqrt((row @ steady @ row.T + direct @ direct.T)[0, 0]))
+
+
+@pytest.mark.parametrize(("seed", "dt"), [(7, 0.2), (14, 0.0), (46, 0.0)])
+def test_a_copy_makes_no_default_slower_beside_process_noise(seed: int, dt: float) -> None:
+    """The mean of two copies has less noise beside that of the process: the price of speed is no reason to be slow."""
+    rng = np.random.default_rng([77, seed])
+    order = int(rng.integers(2, 5))
+    a = rng.standard_normal((order, order)) - 1.5 * np.eye(order)
+    a = scipy.linalg.expm(dt * a) if dt else a
+    c, bf = rng.standard_normal((1, order)), rng.standard_normal((order, 1))
+    process = 0.1 * 10.0 ** rng.uniform(-1.0, 1.0) * np.eye(order)
+    rates = []
+    for copies in (1, 2):
+        plant = obsynth.DescriptorSystem(
+            A=a, C=np.repeat(c, copies, axis=0), Bf=bf, dt=dt,
+            Bw=np.hstack([process, np.zeros((order, copies))]),
+            Dw=np.hstack([np.zeros((copies, order)), 0.1 * np.eye(copies)]),
+        )  # fmt: skip
+        rates.append(obsynth.ui_pi_observer(plant).certificate.claims["decay"])
+    assert rates[1] > rates[0] / 1.001

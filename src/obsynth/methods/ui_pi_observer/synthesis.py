@@ -25,12 +25,12 @@ from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.assembly import assembled
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, kalman_problem, placement_problem
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.regions import NamedRegion
-from obsynth.numerics.spectra import decay_rates
+from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -133,6 +133,11 @@ def synthesise(
             )
     progress("choosing the gains")
     gain, placed_poles, claims, runs = _chosen(method, problem, region, weights, plant.dt)
+    if merged is not None and working.Bw.any() and "noise_price" in claims:
+        picked = [working.output_names.index(name) for name in designed.output_names]
+        single = designed.replace(Dw=working.Dw[picked])
+        alone = placement_problem(single, model, known.fixed_modes, joint=method.joint, paper_matrices=None)
+        problem, gain, claims = _as_fast_as(alone, designed, (problem, gain, claims), weights)
     progress("building the realisation and its certificate")
     gains = problem.gains(gain)
     if merged is not None:
@@ -229,6 +234,42 @@ def _chosen(
     else:
         gain = _for_decay(problem, kalman, problem.rate / time, method.objective, dt)
     return gain, None, claims, runs
+
+
+def _as_fast_as(
+    alone: PlacementProblem,
+    designed: DescriptorSystem,
+    default: tuple[PlacementProblem, FloatArray, Mapping[str, float]],
+    weights: Mapping[str, Any],
+) -> tuple[PlacementProblem, FloatArray, Mapping[str, float]]:
+    """Return the pair of the plant that is designed for, a default gain of it, and what is claimed: those that came
+    out, or ones that are as fast as those of ``alone``, with one sensor of each kind.
+
+    Where process noise is stated and sensors are repeated, the least noise is less, and the same price buys a slower
+    filter.  The gain of one sensor alone has the same poles with the mean of several, and less noise."""
+    problem, gain, claims = default
+    single = kalman_problem(alone, weights)
+    fair = compromise(single, alone.rate)
+    if fair is None:
+        return default
+    own, wanted = (
+        float(np.min(decay_rates(eigenvalues(pair.split.F - k @ pair.split.C), pair.plant.dt), initial=np.inf))
+        for pair, k in ((problem, gain), (alone, fair[0]))
+    )
+    if not own / problem.units.time < wanted / alone.units.time < np.inf:
+        return default
+    both = replace(alone, plant=alone.units.scaled_plant(designed))
+    kalman, plain = kalman_problem(both, weights), np.eye(alone.split.order)
+    best, quieter = fair[0], kalman.quietest_gain(wanted)
+    noise = kalman.deviations(best, plain)
+    if quieter is not None and np.all(kalman.deviations(quieter, plain) <= noise):
+        best, noise = quieter, kalman.deviations(quieter, plain)
+    least = kalman.solved(0.0, plain)[0]
+    price = claims["noise_price"]
+    if least is not None:
+        ratios = noise / np.maximum(kalman.deviations(least, plain), SMALLEST)
+        price = float(np.max(ratios[np.isfinite(ratios)], initial=price))
+    return both, best, {"noise_price": price}
 
 
 def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float) -> FloatArray:
