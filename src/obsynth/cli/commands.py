@@ -117,7 +117,8 @@ def run_check(options: argparse.Namespace) -> int:
         if options.verbose:
             check_report(spec.plant, structures, methods, console=console, transformation=done)
             console.print()
-        print_methods(methods, own=spec.method, console=console)
+        over_region = isinstance(spec.plant, obsynth.PolytopicSystem)
+        print_methods(methods, own=spec.method, over_region=over_region, console=console)
 
     emit(
         options,

@@ -16,6 +16,7 @@ from obsynth.analysis.existence.turning_filter import TURNING_CONDITION
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
+from obsynth.methods.region_trials import region_condition
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
 from obsynth.methods.verifying import verify
 from obsynth.methods.working_plants import working_plant
@@ -246,11 +247,14 @@ def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery:
 def check(
     plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, VerificationReport]:
-    """Return, for every method, the report of its existence conditions; nothing is designed, and what fails is a row.
+    """Return, for every method, the report of its existence conditions; what fails is a row.
+
+    Nothing is designed but for a plant over a region (`PolytopicSystem`): where its points have observers, a small one
+    is designed to see whether one certificate covers the region.
 
     Parameters
     ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem, DAEModel or Transformation
         The plant.
     options : mapping, optional
         Options by method id, of which those that the conditions depend on are used, such as ``fault_model``; those of
@@ -315,12 +319,22 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str
             if not conditions:
                 working = working_plant(plant, None, silent, configured)
                 conditions = (*working.conditions(), *_existence(working.plant, configured))
+                conditions = (*conditions, *_over_region(plant, configured, conditions))
         except SpecError as error:
             if not by_default:
                 raise
             conditions = kind_conditions(plant, known) or (_not_stated(error, method),)
         reports[method] = VerificationReport.of(condition_rows(conditions))
     return reports
+
+
+def _over_region(plant: Plant, method: Method, conditions: Sequence[Condition]) -> list[Condition]:
+    """Return whether one certificate covers the region of a polytopic plant, where its points have observers."""
+    if not isinstance(plant, PolytopicSystem) or not all(condition.holds for condition in conditions):
+        return []
+    each = partial(_designed, plant, method, name="design", recovery=None, progress=silent, advise=False)
+    condition = region_condition(plant, method, each)
+    return [] if condition is None else [condition]
 
 
 def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:

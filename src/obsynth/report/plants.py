@@ -15,6 +15,7 @@ from obsynth.analysis.structure import Structure
 from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import aligned
 from obsynth.methods.optimal_filter.least_possible import least_possible_of
+from obsynth.methods.region_trials import REGION_CONDITION
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -49,6 +50,9 @@ _TIME_CONDITIONS = {
 
 #: Conditions on what a spec says, which the plant cannot fail.
 _ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
+
+#: The row that a certificate covers a region, and the method of nonlinear plants whose conditions are those at points.
+_OVER_REGION, _REGION_OBSERVER = f"exists: {REGION_CONDITION}", "region-observer"
 
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
@@ -99,12 +103,16 @@ def check_report(
     for method, report in methods.items():
         title = f"Existence conditions of {method}"
         print_section(console, title, checks_table(report.checks, width=console.width))
-        console.print(_existence_line(method, report))
+        console.print(
+            _existence_line(
+                method, report, over_region=isinstance(plant, PolytopicSystem) or method == _REGION_OBSERVER
+            )
+        )
 
 
-def _existence_line(method: str, report: VerificationReport) -> Text:
+def _existence_line(method: str, report: VerificationReport, *, over_region: bool) -> Text:
     if report.passed:
-        return Text(f"{method}: all conditions hold, so a design exists.", style="green")
+        return Text(f"{method}: {_all_hold(report, over_region)}.", style="green")
     failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
     if {check.name for check in report.failures} & _ASKED:
         return Text(f"{method}: needs more options: {failed}.", style="yellow")
@@ -182,7 +190,22 @@ def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
     return table
 
 
-def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") -> Iterator[tuple[str, str, str]]:
+def _all_hold(report: VerificationReport, over_region: bool) -> str:
+    """Return in words what follows where all conditions hold."""
+    if not over_region:
+        return "all conditions hold, so a design exists"
+    row = next((check for check in report.checks if check.name == _OVER_REGION), None)
+    if row is None:
+        return (
+            "all conditions hold at points of the region; whether one certificate covers all of it is decided by a "
+            "design (obsynth design)"
+        )
+    return f"all conditions hold, and {row.claim}: {row.detail}".rstrip(": ")
+
+
+def method_lines(
+    methods: Mapping[str, VerificationReport], *, own: str = "", over_region: bool = False
+) -> Iterator[tuple[str, str, str]]:
     """Yield method, verdict in words and style; methods for other kinds of plants come last, in one line."""
     others = []
     for method, report in methods.items():
@@ -190,9 +213,12 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         names = {check.name for check in failed}
         own_method = " (the spec's method)" if method == own else ""
         if report.passed:
-            yield method, f"all conditions hold, so a design exists{own_method}", "green"
+            yield method, f"{_all_hold(report, over_region or method == _REGION_OBSERVER)}{own_method}", "green"
         elif _PLANT_KIND in names and method != own:
             others.append(method)
+        elif _OVER_REGION in names and is_unclear(failed):
+            reason = failed[0].detail.removeprefix("Unclear: ")
+            yield method, f"UNCLEAR for this region{own_method}: {reason}".rstrip("."), "bold red"
         elif names & set(_TIME_CONDITIONS):
             yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + own_method, "yellow"
         elif _OF_THIS_KIND in names:
@@ -207,9 +233,11 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         yield "for other kinds of plants", ", ".join(others), "dim"
 
 
-def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
+def print_methods(
+    methods: Mapping[str, VerificationReport], *, own: str, over_region: bool = False, console: Console
+) -> None:
     """Print the lines of all methods."""
-    for method, text, style in method_lines(methods, own=own):
+    for method, text, style in method_lines(methods, own=own, over_region=over_region):
         lines = textwrap.wrap(
             f"{method}: {text}", min(console.width, 120), subsequent_indent="  ", break_on_hyphens=False
         )

@@ -43,6 +43,8 @@ NOT_OVER_REGION = (
 MARGIN = 1e-3
 #: A state whose deviation is below this share of the largest is as good as known, and counts as if it were that.
 EXACT_STATE = 1e-9
+#: Entries below this share of the terms that they are the difference of are rounding, some hundred times that of one.
+ROUNDING_SHARE = 1e-13
 
 
 def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: Callable[[str], None]) -> Synthesis:
@@ -86,7 +88,7 @@ def _constant_gains(plant: PolytopicSystem, noise: NoiseOverRegion, sizes: Float
     """Return L ``(nx, nx)`` and K ``(nx, ny)`` that are the best for all vertices, or those of the middle."""
     rows, C = free_equations(plant), plant.vertices[0].C
     H = np.vstack([rows @ plant.E, C])
-    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, plant.nx :].T
+    inverse, null = _without_rounding(np.linalg.pinv(H), H, sizes), np.linalg.svd(H)[0][:, plant.nx :].T
     ne = len(rows)
     L0, K0, N1, N2 = inverse[:, :ne] @ rows, inverse[:, ne:], null[:, :ne] @ rows, null[:, ne:]
     V, p = noise.sensor, noise.sensor.shape[1]
@@ -115,6 +117,19 @@ def _constant_gains(plant: PolytopicSystem, noise: NoiseOverRegion, sizes: Float
         "No Kalman filter of the middle of the region was found by its inequality. State Q and R in the units of "
         "equations and outputs, or take a smaller region."
     )
+
+
+def _without_rounding(inverse: FloatArray, H: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return an inverse without the entries that are only rounding: where an output alone determines a state, nothing
+    of the equations enters it, and identities are compared with terms that count."""
+    shares = np.abs(inverse) * np.linalg.norm(H * sizes, axis=1)
+    return np.where(shares <= ROUNDING_SHARE * np.max(shares, axis=1, keepdims=True), 0.0, inverse)
+
+
+def _unread(C: FloatArray, N: FloatArray) -> FloatArray:
+    """Return ``I - C N``, without the entries that are only rounding."""
+    rest = np.eye(len(C)) - C @ N
+    return np.where(np.abs(rest) <= ROUNDING_SHARE * (np.eye(len(C)) + np.abs(C) @ np.abs(N)), 0.0, rest)
 
 
 def _sizes(plant: PolytopicSystem, noise: NoiseOverRegion) -> FloatArray:
@@ -157,7 +172,7 @@ def _errors(plant: PolytopicSystem, noise: NoiseOverRegion, T: FloatArray, N: Fl
             np.hstack([T @ W, -(T @ vertex.A) @ (N @ V)])
             for vertex, W in zip(plant.vertices, noise.process, strict=True)
         ],
-        D=np.hstack([np.zeros((plant.ny, q)), (np.eye(plant.ny) - C @ N) @ V]),
+        D=np.hstack([np.zeros((plant.ny, q)), _unread(C, N) @ V]),
         Cz=np.eye(n),
         Dz=np.hstack([np.zeros((n, q)), -N @ V]),
         dt=plant.dt,
@@ -168,7 +183,7 @@ def _observer(
     plant: PolytopicSystem, T: FloatArray, N: FloatArray, gains: Sequence[FloatArray], decay: float
 ) -> ScheduledObserver:
     """Return the observer of states, with innovations as residuals."""
-    first, unseen = plant.vertices[0], np.eye(plant.ny) - plant.vertices[0].C @ N
+    first, unseen = plant.vertices[0], _unread(plant.vertices[0].C, N)
     By = [T @ vertex.A @ N + S @ unseen for vertex, S in zip(plant.vertices, gains, strict=True)]
     Dy = np.vstack([N, unseen])
     return ScheduledObserver(
