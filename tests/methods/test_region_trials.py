@@ -19,6 +19,7 @@ def _plant(**changes: object) -> PolytopicSystem:
     return PolytopicSystem(plant={**plant, "dt": 1.0, **changes}, scheduling={"v": [-1, 1]})
 
 
+@pytest.mark.long
 def test_a_check_says_what_one_certificate_proves_over_the_region() -> None:
     reports = obsynth.check(_plant())
     row = reports["fault-estimation-filter"][ROW]
