@@ -19,6 +19,7 @@ from obsynth.monitoring.thresholds.learning import learn_thresholds
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
+from obsynth.monitoring.thresholds.region_bounds import region_bound
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of, require_no_region
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
@@ -29,6 +30,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.constants import shown
 from obsynth.plants.noise import is_noise_assumed, require_noise
 from obsynth.plants.signal_names import suggestion
@@ -41,6 +43,10 @@ _AFTER_WARM_UP = "; it holds once the initial-condition response has settled (th
 _AFTER_A_GAP = " (after a gap likewise)"
 
 _FROM_THE_FIRST = "; from the first row on; after gaps, once settled"
+
+_AFTER_OUT = _AFTER_WARM_UP + " (after a gap, and after rows outside the region, likewise)"
+
+_FROM_THE_FIRST_INSIDE = "; from the first row on; after gaps, and after rows outside the region, once settled"
 
 #: A note of every monitor whose noise is none that somebody stated.
 NOISE_ASSUMED = "; noise of deviation 1 is assumed on every sensor, as none is stated"
@@ -176,6 +182,8 @@ def online_monitor(
         return _learned(design, normal, sensor_faults=sensor_faults)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
+    if isinstance(design.observer, ScheduledObserver) and kind == "pointwise":
+        return _over_region(design, options)
     require_no_region(design, kind)
     _require_linear_kind(kind, nominal)
     if is_guaranteed(design):
@@ -219,6 +227,34 @@ def online_monitor(
     numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
     return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)
+
+
+def _over_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
+    """Return the monitor of a scheduled design, whose bound holds for every course of its parameters."""
+    unsupported = ("scenario", "gamma", "sample_time", "constants", "initial_set")
+    if stated := [name for name in unsupported if options[name] is not None]:
+        raise SpecError(
+            f"{stated[0]} is not for designs over a region: give disturbance_bounds, noise_bound and initial_error.",
+            path=stated[0],
+        )
+    noise_bound, start = options["noise_bound"], options["initial_error"]
+    (table, limit), model, bounds = region_bound(design, options["disturbance_bounds"], noise_bound, start)
+    require_noise(noise_bound, noisy=model.noisy)
+    _require_above_rounding("pointwise", limit, model, bounds)
+    plant, observer = design.scheduled
+    assumed = Assumptions(plant.vertices[0], bounds, noise_bound or 0.0, initial_error=start)
+    return Monitor(
+        "pointwise",
+        statement_of("pointwise", model, assumed, estimates=False)
+        + f", for every course of {', '.join(plant.scheduling.names)} in the region"
+        + (_AFTER_OUT if start is None else _FROM_THE_FIRST_INSIDE)
+        + (NOISE_ASSUMED if is_noise_assumed(plant.vertices[0].noise_names) else "")
+        + NO_TOLERANCE,
+        NormRule(table, limit, window=1, dt=plant.dt),
+        residuals=len(observer.residual_names),
+        fault_names=observer.fault_names,
+        fault_scales=model.fault_scales(),
+    )
 
 
 def _learned(design: ObserverDesign, normal: Any, *, sensor_faults: bool) -> Monitor:

@@ -204,10 +204,11 @@ def monitor(
 
 
 def require_no_region(design: ObserverDesign, kind: str) -> None:
-    """Raise `SpecError` for designs over a region, whose residuals have no other bound than one that is learned."""
+    """Raise `SpecError` for designs over a region, which have no such bound of their residuals."""
     if isinstance(design.observer, (RegionObserver, ScheduledObserver)):
         raise SpecError(
-            f"Design {design.name!r} is over a region, where the monitor {kind!r} has no bound of the residual: learn "
+            f"Design {design.name!r} is over a region, where the monitor {kind!r} has no bound of the residual. Take "
+            "pointwise on data (obsynth.online_monitor) for a scheduled design in discrete time, or learn "
             "thresholds from rows without faults (kind 'learned' with normal=...).",
             path="kind",
         )

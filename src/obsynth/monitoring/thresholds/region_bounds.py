@@ -1,0 +1,169 @@
+r"""What the residual of a scheduled design never passes without a fault, for every course of its parameters.
+
+With bounded inputs w (each at most one) the residual of ``e+ = M(mu) e + B(mu) w``, ``r = C e + D w`` after k samples
+
+.. math::
+    r_k = C M_{k-1} \cdots M_0 e_0 + D w_k + \sum_j C M_{k-1} \cdots M_{k-j+1} B_{k-j} w_{k-j}
+
+is bounded by the sum of the norms of the columns.  That is convex in the weights of each sample, with those of the
+others fixed: its largest value is at a course of vertices.  The courses of the latest samples are enumerated; what is
+older is bounded in the norm of the certificate, in which errors shrink by the proved factor in every sample:
+:math:`|e_{k+1}|_P \le \rho |e_k|_P + \beta`.  The decay is proved again from the stored matrices before it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model
+from obsynth.monitoring.thresholds.residual_monitor import bounds_of
+from obsynth.monitoring.thresholds.stated_noise import LEFT_AFTER_TABLE, UnlimitedHorizonBound, scaled_inputs
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.proofs.vertex_inequalities import pairs_of, prove_decay
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.over_region import WITNESSES, witness_of_certificate
+from obsynth.verification.over_tolerances.responses import OUTWARD
+
+#: Courses that are enumerated: some milliseconds for each sample of them.
+MOST_COURSES = 4096
+#: Rows of a table while the effect of a start settles.
+MOST_TABLE = 16_384
+#: Samples of which courses are enumerated at most; one vertex has one course.
+MOST_SAMPLES = 64
+
+
+class ErrorsAtVertices(NamedTuple):
+    """The error system at each vertex, every input scaled to at most one."""
+
+    M: FloatArray  # ``(N, n, n)``
+    B: FloatArray  # ``(N, n, m)``
+    C: FloatArray  # ``(nr, n)``
+    D: FloatArray  # ``(nr, m)``
+
+
+def region_bound(
+    design: ObserverDesign,
+    disturbance_bounds: Mapping[str, float] | None,
+    noise_bound: float | None,
+    initial_error: float | None,
+) -> tuple[UnlimitedHorizonBound, ResidualModel, FloatArray]:
+    """Return a table of bounds from the first row on and one for ever after; the model at a vertex, and the bounds of
+    disturbances.
+
+    Without ``initial_error`` there is no table: the bound holds once the effect of the start has settled.
+    """
+    errors, model, bounds = _errors_at_vertices(design, disturbance_bounds, noise_bound)
+    return (
+        _bound(errors, _lyapunov_matrices(design, errors), design.certificate.claims["region_decay"], initial_error),
+        (model),
+        bounds,
+    )
+
+
+def _errors_at_vertices(
+    design: ObserverDesign, disturbance_bounds: Mapping[str, float] | None, noise_bound: float | None
+) -> tuple[ErrorsAtVertices, ResidualModel, FloatArray]:
+    plant, observer = design.scheduled
+    _require_supported(design, observer)
+    made, model, bounds = [], None, np.zeros(0)
+    for place, vertex in enumerate(plant.vertices):
+        own = design.replace(plant=vertex, observer=observer.before_division(place))
+        scenario = Scenario(horizon=2.0 * plant.dt, noise=1.0 if vertex.nw else 0.0)
+        model = residual_model(own, scenario, endless=True)
+        bounds = np.full(plant.nd, np.inf)
+        stated = list(disturbance_bounds or {})
+        known = bounds_of(own, model, disturbance_bounds)
+        bounds = np.where([name in stated for name in plant.disturbance_names], known, bounds)
+        inputs = scaled_inputs(model, bounds, noise_bound, plant.disturbance_names)
+        made.append((model.A, inputs.B, model.C, inputs.D))
+    if model is None:  # a plant has a vertex
+        raise SpecError("The plant has no vertex.", path="plant")
+    M, B, C, D = (np.array(part) for part in zip(*made, strict=True))
+    if (C[0] != C).any() or (D[0] != D).any():
+        raise SpecError(
+            "The residual of this design changes with the parameters: learn thresholds from rows without faults (kind "
+            "'learned' with normal=...).",
+            path="kind",
+        )
+    return ErrorsAtVertices(M, B, C[0], D[0]), model, bounds
+
+
+def _require_supported(design: ObserverDesign, observer: ScheduledObserver) -> None:
+    problem = ""
+    if observer.dt == 0.0:
+        problem = "is continuous in time, where rows may be any time apart"
+    elif observer.correction is not None:
+        problem = "corrects its states with the parameters of the sample before"
+    elif not {"tracking", WITNESSES[0]} <= set(design.certificate.matrices):
+        problem = "has no certificate of decay"
+    if problem:
+        raise SpecError(
+            f"Design {design.name!r} {problem}: there is no guaranteed threshold over a region for it. Learn "
+            "thresholds from rows without faults (kind 'learned' with normal=...).",
+            path="kind",
+        )
+
+
+def _lyapunov_matrices(design: ObserverDesign, errors: ErrorsAtVertices) -> list[FloatArray]:
+    """Return the matrices of the certificate in whose norm the stated decay is proved again."""
+    plant, _ = design.scheduled
+    matrices = design.certificate.matrices
+    steps = plant.scheduling.step_of(plant.dt) if WITNESSES[1] in matrices else None
+    witness = witness_of_certificate(matrices, None if steps is None else pairs_of(plant.count, steps))
+    n = errors.M.shape[1]
+    closed = ErrorPolytope(list(errors.M), np.zeros((0, n)), dt=plant.dt).closed([np.zeros((n, 0))])
+    decay = design.certificate.claims.get("region_decay", np.nan)
+    proved = witness is not None and 0.0 <= decay < 1.0 and prove_decay(closed, witness, decay, discrete=True).proved
+    if witness is None or not proved:
+        raise SpecError(
+            f"The decay of the errors of design {design.name!r} over its region is not proved below one: there is no "
+            "guaranteed threshold. Learn thresholds from rows without faults (kind 'learned' with normal=...).",
+            path="kind",
+        )
+    return list(witness.P)
+
+
+def _bound(
+    errors: ErrorsAtVertices, P: list[FloatArray], decay: float, initial_error: float | None
+) -> UnlimitedHorizonBound:
+    roots = [np.linalg.cholesky(matrix) for matrix in P]
+    driven = max(_columns(root.T @ B) for root in roots for B in errors.B)
+    settled = driven / (1.0 - decay)
+    start = settled if initial_error is None else initial_error * max(float(np.linalg.norm(root, 2)) for root in roots)
+    inverses = [np.linalg.inv(root).T for root in roots]
+
+    def tails(courses: FloatArray) -> FloatArray:
+        sizes = [np.linalg.norm(courses @ inverse, 2, axis=(1, 2)) for inverse in inverses]
+        return np.asarray(np.max(sizes, axis=0))
+
+    courses, sums = errors.C[None], np.array([_columns(errors.D)])
+    table = []
+    for _ in range(_depth(len(errors.M))):
+        table.append(float(np.max(sums + tails(courses) * start)))
+        sums = np.concatenate([sums + np.linalg.norm(courses @ B, axis=1).sum(axis=1) for B in errors.B])
+        courses = np.concatenate([courses @ M for M in errors.M])
+    far = tails(courses)
+    if initial_error is None:
+        return np.zeros(0), float(np.max(sums + far * settled)) * OUTWARD
+    size = start
+    while size > settled * (1.0 + LEFT_AFTER_TABLE) and len(table) < MOST_TABLE:
+        table.append(float(np.max(sums + far * size)))
+        size = decay * size + driven
+    return np.array(table) * OUTWARD, float(np.max(sums + far * max(size, settled))) * OUTWARD
+
+
+def _depth(vertices: int) -> int:
+    """Return of how many samples the courses are enumerated."""
+    return MOST_SAMPLES if vertices == 1 else int(np.log(MOST_COURSES) / np.log(vertices) + 1e-9)
+
+
+def _columns(matrix: FloatArray) -> float:
+    """Return the sum of the norms of columns."""
+    return float(np.sum(np.linalg.norm(matrix, axis=0)))
