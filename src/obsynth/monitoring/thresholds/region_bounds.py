@@ -7,8 +7,8 @@ With bounded inputs w (each at most one) the residual of ``e+ = M(mu) e + B(mu) 
 
 is bounded by the sum of the norms of the columns.  That is convex in the weights of each sample, with those of the
 others fixed: its largest value is at a course of vertices.  The courses of the latest samples are enumerated; what is
-older is bounded in the norm of the certificate, in which errors shrink by the proved factor in every sample:
-:math:`|e_{k+1}|_P \le \rho |e_k|_P + \beta`.  The decay is proved again from the stored matrices before it is used.
+older is bounded in the norm of the certificate, in which errors shrink along every course of as many samples:
+:math:`|e_{k+J}|_P \le c |e_k|_P + \beta`.  The decay is proved again from the stored matrices before it is used.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ from obsynth.verification.over_tolerances.responses import OUTWARD
 
 #: Courses that are enumerated: some milliseconds for each sample of them.
 MOST_COURSES = 4096
+#: Entries of the products along all courses: 32 MB of doubles.
+MOST_ENTRIES = 4_194_304
 #: Rows of a table while the effect of a start settles.
 MOST_TABLE = 16_384
 #: Samples of which courses are enumerated at most; one vertex has one course.
@@ -133,35 +135,61 @@ def _lyapunov_matrices(design: ObserverDesign, errors: ErrorsAtVertices) -> list
 def _bound(
     errors: ErrorsAtVertices, P: list[FloatArray], decay: float, initial_error: float | None
 ) -> UnlimitedHorizonBound:
-    roots = [np.linalg.cholesky(matrix) for matrix in P]
-    driven = max(_columns(root.T @ B) for root in roots for B in errors.B)
-    settled = driven / (1.0 - decay)
-    start = settled if initial_error is None else initial_error * max(float(np.linalg.norm(root, 2)) for root in roots)
-    inverses = [np.linalg.inv(root).T for root in roots]
-
-    def tails(courses: FloatArray) -> FloatArray:
-        sizes = [np.linalg.norm(courses @ inverse, 2, axis=(1, 2)) for inverse in inverses]
-        return np.asarray(np.max(sizes, axis=0))
-
-    courses, sums = errors.C[None], np.array([_columns(errors.D)])
-    table = []
-    for _ in range(_depth(len(errors.M))):
-        table.append(float(np.max(sums + tails(courses) * start)))
-        sums = np.concatenate([sums + np.linalg.norm(courses @ B, axis=1).sum(axis=1) for B in errors.B])
-        courses = np.concatenate([courses @ M for M in errors.M])
-    far = tails(courses)
-    if initial_error is None:
+    # In these coordinates errors shrink: the norm of one P, or that of the middle of several.
+    root = np.linalg.cholesky(np.mean(P, axis=0)).T
+    inverse = np.linalg.inv(root)
+    M, B, depth = root @ errors.M @ inverse, root @ errors.B, _depth(*errors.M.shape[:2])
+    start = None if initial_error is None else initial_error * float(np.linalg.norm(root, 2))
+    residual, sums = (errors.C @ inverse)[None], np.array([_columns(errors.D)])
+    error, driven = np.eye(len(root))[None], np.zeros(1)
+    table, shrunk, reached = [], list[float](), list[float]()
+    for step in range(depth + 1):
+        shrunk.append(float(np.max(_norms(error))))
+        reached.append(float(np.max(driven)))
+        if step == depth:
+            break
+        table.append(float(np.max(sums + _norms(residual) * (start or 0.0))))
+        sums, residual = _one_earlier(residual, sums, M, B)
+        driven, error = _one_earlier(error, driven, M, B)
+    # From so many samples before: at most a share of the error then, and what acts since.
+    share, since = shrunk[-1], reached[-1]
+    if len(P) == 1:
+        share = min(share, decay**depth)
+        since = min(since, max(map(_columns, B)) * (1.0 - decay**depth) / (1.0 - decay))
+    settled = since / (1.0 - share) if share < 1.0 else np.inf
+    if not np.isfinite(settled):
+        raise SpecError(
+            "The errors decay too slowly for a guaranteed threshold over the region: learn thresholds from rows "
+            "without faults (kind 'learned' with normal=...).",
+            path="kind",
+        )
+    far = _norms(residual)
+    if start is None:
         return np.zeros(0), float(np.max(sums + far * settled)) * OUTWARD
-    size = start
-    while size > settled * (1.0 + LEFT_AFTER_TABLE) and len(table) < MOST_TABLE:
-        table.append(float(np.max(sums + far * size)))
-        size = decay * size + driven
-    return np.array(table) * OUTWARD, float(np.max(sums + far * max(size, settled))) * OUTWARD
+    sizes = [g * start + b for g, b in zip(shrunk[:-1], reached[:-1], strict=True)]
+    while max(sizes[-depth:]) > settled * (1.0 + LEFT_AFTER_TABLE) and len(sizes) < MOST_TABLE:
+        sizes.append(share * sizes[-depth] + since)
+    table += [float(np.max(sums + far * size)) for size in sizes[:-depth]]
+    return np.array(table) * OUTWARD, float(np.max(sums + far * max(settled, *sizes[-depth:]))) * OUTWARD
 
 
-def _depth(vertices: int) -> int:
-    """Return of how many samples the courses are enumerated."""
-    return MOST_SAMPLES if vertices == 1 else int(np.log(MOST_COURSES) / np.log(vertices) + 1e-9)
+def _one_earlier(courses: FloatArray, sums: FloatArray, M: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return sums and products of courses that begin a sample earlier, at every vertex."""
+    more = np.concatenate([sums + np.linalg.norm(courses @ b, axis=1).sum(axis=1) for b in B])
+    return more, np.concatenate([courses @ m for m in M])
+
+
+def _norms(matrices: FloatArray) -> FloatArray:
+    """Return the spectral norms of matrices ``(K, m, n)``."""
+    return np.asarray(np.linalg.norm(matrices, 2, axis=(1, 2)))
+
+
+def _depth(vertices: int, order: int) -> int:
+    """Return of how many samples the courses are enumerated, one at least."""
+    courses = min(MOST_COURSES, MOST_ENTRIES // max(order, 1) ** 2)
+    if vertices == 1:
+        return MOST_SAMPLES
+    return max((depth for depth in range(1, MOST_SAMPLES) if vertices**depth <= courses), default=1)
 
 
 def _columns(matrix: FloatArray) -> float:
