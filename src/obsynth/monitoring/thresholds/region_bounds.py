@@ -21,7 +21,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model
 from obsynth.monitoring.thresholds.residual_monitor import bounds_of
-from obsynth.monitoring.thresholds.stated_noise import LEFT_AFTER_TABLE, UnlimitedHorizonBound, scaled_inputs
+from obsynth.monitoring.thresholds.stated_noise import REMAINDER_AFTER_TABLE, UnlimitedHorizonBound, scaled_inputs
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.proofs.vertex_inequalities import pairs_of, prove_decay
@@ -167,7 +167,7 @@ def _bound(
     if start is None:
         return np.zeros(0), float(np.max(sums + far * settled)) * OUTWARD
     sizes = [g * start + b for g, b in zip(shrunk[:-1], reached[:-1], strict=True)]
-    while max(sizes[-depth:]) > settled * (1.0 + LEFT_AFTER_TABLE) and len(sizes) < MOST_TABLE:
+    while max(sizes[-depth:]) > settled * (1.0 + REMAINDER_AFTER_TABLE) and len(sizes) < MOST_TABLE:
         sizes.append(share * sizes[-depth] + since)
     table += [float(np.max(sums + far * size)) for size in sizes[:-depth]]
     return np.array(table) * OUTWARD, float(np.max(sums + far * max(settled, *sizes[-depth:]))) * OUTWARD
