@@ -20,11 +20,14 @@ from obsynth.plants.transformations.recovery import StateRecovery, Transformatio
 if TYPE_CHECKING:
     from obsynth.analysis.diagnosis.explanations import Sensor
 
+#: Options whose values belong to the states and equations as written.
+_OF_STATES_AS_WRITTEN = ("Q", "initial_state", "initial_covariance", "state_bounds")
+
 
 @dataclass(frozen=True, eq=False)
 class WorkingPlant:
     """A plant with the way back to the one as written, and what a user should know; ``reduced``: what was done to a
-    plant of index 2 or more."""
+    plant of index 2 or more, or with algebraic states that a method does not take."""
 
     plant: Plant
     recovery: StateRecovery | None
@@ -61,7 +64,7 @@ def working_plant(
         if transformation is None:
             return WorkingPlant(plant, recovery)
         progress("reducing the index")
-        notes = (f"The plant has index 2 or more: {transformation.description}.", *notes)
+        notes = (f"{_reason(plant)}: {transformation.description}.", *notes)
         return WorkingPlant(
             transformation.plant,
             _composed_recovery(recovery, transformation),
@@ -81,18 +84,40 @@ def _composed_recovery(recovery: StateRecovery | None, transformation: Transform
 
 
 def _of_low_index(plant: DescriptorSystem, method: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
-    """Return the minimal proper form of a plant of index 2 or more, and what was left out for it; ``None`` for any
-    other plant, or where the method takes it as written."""
-    if plant.nx > EXACT_ELIMINATION_UP_TO or (structure_of(plant).index or 0) < 2:
+    """Return the minimal proper form of a plant of index 2 or more, or of one of index 1 that the method takes in that
+    form alone, and what was left out for it; ``None`` for any other plant, or where the method takes it as written."""
+    index = structure_of(plant).index or 0
+    if plant.nx > EXACT_ELIMINATION_UP_TO or index == 0:
         return None, ()
     if method is not None and method.is_for_states_as_written(plant):
         return None, ()
+    if index == 1:
+        return _without_algebraic_states(plant, method), ()
     try:
         return eliminate_algebraic_states(plant), ()
     except PreconditionError as error:
         if error.condition != "index" or method is None or _exists(plant, method):
             return None, ()
     return _with_input_derivatives(plant) or _without_improper_outputs(plant)
+
+
+def _reason(plant: DescriptorSystem) -> str:
+    if structure_of(plant).index == 1:
+        return "The method takes algebraic states only where they are measured"
+    return "The plant has index 2 or more"
+
+
+def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) -> Transformation | None:
+    """Return a plant of index 1 without its algebraic states where a method takes it in that form alone."""
+    if method is None or any(getattr(method, name, None) is not None for name in _OF_STATES_AS_WRITTEN):
+        return None
+    if _exists(plant, method):
+        return None
+    try:
+        eliminated = eliminate_algebraic_states(plant)
+    except PreconditionError:
+        return None
+    return eliminated if _exists(eliminated.plant, method) else None
 
 
 def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tuple[str, ...]] | None:
