@@ -466,7 +466,7 @@ PRECONDITIONS = [
     ),
     impossible(
         "fault that looks like a state",
-        plant(E=[[1, 0], [0, 0]], A=[[0.5, 0], [0, 1]], C=[[0, 1]], Bf=[[0], [0]], Df=[[1]]),
+        plant(E=[[1, 0], [0, 0]], A=[[0.5, 1], [1, 0]], C=[[0, 1]], Bf=[[0], [0]], Df=[[1]]),
         "rank [E 0; 0 0; C Df]",
         "f1",
         signals=["f1"],

@@ -44,7 +44,8 @@ def outcomes(found):
 
 
 def test_all_combinations_of_options_and_sensors(spec):
-    found = obsynth.sweep(spec, {"gamma_margin": [0.05, 0.5], "plant.C.outputs": [["x1", "x3"], ["x1"]]})
+    (spec.parent / "plant.yaml").write_text(PLANT.replace("[0, 0.5, 0.3]", "[0, 0.5, 0]"))  # x2 shows nothing of x1
+    found = obsynth.sweep(spec, {"gamma_margin": [0.05, 0.5], "plant.C.outputs": [["x1", "x3"], ["x2"]]})
     assert len(found) == 4
     assert found.counts == {"designed": 2, "impossible": 2}
     assert [r.status for r in found.results] == ["designed", "impossible"] * 2

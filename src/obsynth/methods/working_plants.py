@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 #: Options whose values belong to the states and equations as written.
 _OF_STATES_AS_WRITTEN = ("Q", "initial_state", "initial_covariance", "state_bounds")
 
+#: Conditions that every state is dynamic or measured, which no observer needs.
+_DYNAMIC_OR_MEASURED = ("rank [E; C]", "rank [E 0; 0 0; C Df]")
+
 
 @dataclass(frozen=True, eq=False)
 class WorkingPlant:
@@ -111,7 +114,11 @@ def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) ->
     """Return a plant of index 1 without its algebraic states where a method takes it in that form alone."""
     if method is None or any(getattr(method, name, None) is not None for name in _OF_STATES_AS_WRITTEN):
         return None
-    if _exists(plant, method):
+    try:
+        failed = [condition for condition in method.existence(plant) if not condition.holds]
+    except PreconditionError:
+        return None
+    if not failed or failed[0].unclear or failed[0].name not in _DYNAMIC_OR_MEASURED:
         return None
     try:
         eliminated = eliminate_algebraic_states(plant)
