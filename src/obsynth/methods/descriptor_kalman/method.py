@@ -82,9 +82,10 @@ class DescriptorKalman(Method):
     SpecError
         A covariance is not symmetric or indefinite, or an option has the wrong shape.
     PreconditionError
-        ``rank [E_k; C_k] < nx`` at some k, which is named (with early constraints their rows count); where E, A and C
-        are constant, a mode with ``|z| >= 1`` that is unobservable; where they change, errors that do not decay
-        along the horizon, or outgrow double precision at some k.
+        ``rank [E_k; C_k] < nx`` at some k, which is named (with early constraints their rows count; where matrices are
+        constant and no option is about the states as written, algebraic states are eliminated instead); where E, A and
+        C are constant, a mode with ``|z| >= 1`` that is unobservable; where they change, errors that do not decay along
+        the horizon, or outgrow double precision at some k.
     VerificationError
         The observer fails a check.
 

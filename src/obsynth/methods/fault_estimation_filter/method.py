@@ -120,8 +120,9 @@ class FaultEstimationFilter(Method):
     SpecError
         An option is out of range, S or W has the wrong shape, or ``W Upsilon`` is not the identity.
     PreconditionError
-        ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that reaches no output, ``rank Upsilon <
-        nf`` (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
+        ``rank [E; C] < nx`` (eq. (2)) after the algebraic states of a plant of index 1 are eliminated too, dependent
+        faults, a fault that reaches no output, ``rank Upsilon < nf`` (Theorem 2 (i)), or an invariant zero from the
+        faults to the outputs on or outside the unit circle.
     InfeasibleError
         No filter of this structure reaches ``gamma``, for this T, N and W.
     SolverError
