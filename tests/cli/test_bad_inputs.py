@@ -406,7 +406,11 @@ PRECONDITIONS = [
     ),
     impossible(
         "rank [E; C]",
-        put("plant", "C", [[0, 1, 0, 0], [0, 0, 1, 0]]),
+        lambda spec: (
+            spec["plant"].update(C=[[0, 1, 0, 0], [0, 0, 1, 0]]),
+            # What is given for the states as written keeps them.
+            spec["method"]["options"].update(S=[[0] * 6] * 4),
+        ),
         "rank [E; C]",
         "Needed: rank [E; C] = 4.",
         signals=["x4"],

@@ -24,6 +24,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
+from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.modes import modes_of
 from obsynth.observers.linear.observer import LinearObserver
@@ -119,7 +120,8 @@ def _gain_set_rows(
     equations = Equations.of(plant, work, observer.fault_delays)
     options = design.options
     yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
-    yield from weight_rows(gains, options.get("weight"))
+    if options.get("weight") != "paper" or decide_rank(work.C).rank == work.ny:
+        yield from weight_rows(gains, options.get("weight"))
     yield from _least_gain(design, work)
     return allowances
 

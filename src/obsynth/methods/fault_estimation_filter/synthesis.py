@@ -99,37 +99,13 @@ def synthesise(
         raise _for_independent_outputs("S", "S", plant, merged)
     if method.given_weight is not None:
         raise _for_independent_outputs("A given W", "weight", plant, merged)
-    if paper:
-        return _with_weight_of_the_paper(plant, merged, method, progress)
     made = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, method, progress))
     if not _is_as_labelled(made):
+        if paper:
+            raise _for_independent_outputs("The paper's W", "weight", plant, merged)
         free = replace(method, weight="free")
         made = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, free, progress))
     return made if near is None else _less_noisy(plant, near, made, method, progress)
-
-
-def _with_weight_of_the_paper(
-    plant: DescriptorSystem, merged: MergedOutputs, method: FaultEstimationFilter, progress: Callable[[str], None]
-) -> Synthesis:
-    """Return the filter of a plant with dependent outputs whose W is the pseudoinverse of Upsilon, as the paper's.
-
-    With ``C = Q C_p`` and ``M = Q^+``, ``W_p = (Q Upsilon_p)^+ Q`` is a left inverse of Upsilon_p, and ``W_p M = (Q
-    Upsilon_p)^+``, as the rows of the latter are in the range of Q."""
-    alike = merged.without_noise(plant)
-    conditions, prepared = examine_fault_filter(alike.plant)
-    require_all(conditions)
-    # Q from its own pseudoinverse.
-    q = np.linalg.pinv(alike.weights)
-    prepared = prepare(alike.plant, None) if prepared is None else prepared
-    upsilon = prepared.detectability.Upsilon / prepared.scaling.outputs[:, None]
-    units = np.linalg.norm(q @ upsilon, axis=0)
-    weight = np.linalg.pinv(q @ upsilon / units) / units[:, None] @ q
-    given = replace(method, weight=weight.tolist())
-    made = _of_merged(plant, alike, _synthesised(alike.plant, conditions, prepared, given, progress))
-    made = replace(made, options={**made.options, "weight": "paper"})
-    if not _is_as_labelled(made):
-        raise _for_independent_outputs("The paper's W", "weight", plant, merged)
-    return made
 
 
 def _less_noisy(

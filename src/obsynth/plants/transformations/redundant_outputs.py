@@ -39,17 +39,6 @@ class MergedOutputs:
     weights: FloatArray
     exact: bool
 
-    def without_noise(self, plant: DescriptorSystem) -> MergedOutputs:
-        """Return the same outputs of ``plant`` as means in which all measured ones count alike, whatever their
-        noise."""
-        # Q, by which the measured outputs follow from these: any M with M Q = I has the same.
-        own = np.hstack([self.plant.C, self.plant.Df, self.plant.Dd])
-        measured = np.hstack([plant.C, plant.Df, plant.Dd])
-        q = measured @ np.linalg.pinv(own)
-        weights = np.linalg.pinv(q)
-        merged = self.plant.replace(D=weights @ plant.D, Dw=weights @ plant.Dw)
-        return MergedOutputs(merged, read_only(weights), self.exact)
-
 
 @remembered
 def merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
