@@ -163,12 +163,7 @@ def slope_inequality(
         constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
     if decay is not None:
         with_multiplier("decay", 2.0 * decay * P, driven=False)
-    if room is not None:
-        constraints["room"] = room <= MOST_ROOM
-    if goal == "decay":
-        constraints["trace"] = cp.trace(P) <= TRACE * n
-    if gain_limit is not None and given is None:
-        constraints["limit"] = cp.norm(Y1, "fro") <= gain_limit
+    constraints |= _limits(goal, P, room, Y1, gain_limit if given is None else None)
     objective = cp.Minimize(squared) if room is None else cp.Maximize(room)
     variables = {part.name(): part for part in (*P.variables(), *G.variables(), *([Y1] if given is None else []))}
     variables |= {"room": room} if room is not None else {name: squared}
@@ -192,6 +187,18 @@ def slope_inequality(
         gains,
         unsupported,
     )
+
+
+def _limits(goal: str, P: Any, room: Any, Y: Any, gain_limit: float | None) -> dict[str, Any]:
+    """Return what bounds the slack, the scale of a homogeneous inequality, and the gain."""
+    limits: dict[str, Any] = {}
+    if room is not None:
+        limits["room"] = room <= MOST_ROOM
+    if goal == "decay":
+        limits["trace"] = cp.trace(P) <= TRACE * P.shape[0]
+    if gain_limit is not None:
+        limits["limit"] = cp.norm(Y, "fro") <= gain_limit
+    return limits
 
 
 def _require_options(errors: SlopedErrors, goal: str, multiplier: str, decay: float | None) -> None:

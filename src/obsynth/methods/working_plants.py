@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
+from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
@@ -114,6 +117,8 @@ def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) ->
     """Return a plant of index 1 without its algebraic states where a method takes it in that form alone."""
     if method is None or any(getattr(method, name, None) is not None for name in _OF_STATES_AS_WRITTEN):
         return None
+    if _is_dynamic_or_measured(plant):
+        return None
     try:
         failed = [condition for condition in method.existence(plant) if not condition.holds]
     except PreconditionError:
@@ -125,6 +130,14 @@ def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) ->
     except PreconditionError:
         return None
     return eliminated if _exists(eliminated.plant, method) else None
+
+
+def _is_dynamic_or_measured(plant: DescriptorSystem) -> bool:
+    """Whether every state is, sensor faults as states too: then no method refuses the plant for one that is not."""
+    sensor_faults = plant.Df[:, np.any(plant.Df != 0.0, axis=0)]
+    nothing = np.zeros((plant.nx, sensor_faults.shape[1]))
+    stacked = np.block([[plant.E, nothing], [plant.C, sensor_faults]])
+    return bool(decide_rank(stacked).rank == stacked.shape[1])
 
 
 def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tuple[str, ...]] | None:

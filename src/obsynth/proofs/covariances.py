@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.spectra import abscissa, noise_covariance
-from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.extended_balls import arb_matrix, middles
 
 #: Relative difference of two ways of computing a variance up to which double precision is believed.
 SURE_DIFFERENCE = 1e-6
@@ -63,7 +63,7 @@ def enclosed_noise_covariance(
             if dt > 0.0:
                 outputs = outputs + arb_matrix(d) * arb_matrix(d).transpose()
             values = np.reshape(outputs.entries(), (len(c), len(c)))
-            covariance = np.array([[float(value.mid()) for value in row] for row in values]).reshape(values.shape)
+            covariance = middles(outputs)
             radii = np.array([[float(value.rad()) for value in row] for row in values]).reshape(values.shape)
         sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         if np.all(np.isfinite(covariance)) and np.all(radii <= RADIUS * np.outer(sizes, sizes)):

@@ -75,6 +75,12 @@ def enclosed_eigenvalues(matrix: FloatArray) -> tuple[Any, ...] | None:
     return None
 
 
+def middles(matrix: Any) -> FloatArray:
+    """Return the middles of an ``arb_mat (n, m)`` in double precision."""
+    numbers = np.array([float(value.mid()) for value in matrix.entries()])
+    return numbers.reshape(int(matrix.nrows()), int(matrix.ncols()))
+
+
 def middle_of(ball: Any) -> complex:
     """Return the middle of a complex ball, to double precision."""
     return complex(float(ball.real.mid()), float(ball.imag.mid()))

@@ -18,6 +18,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.proofs.extended_balls import middles
 
 #: Chordal distances of eigenvalues of a group, tried in turn: rounding parts a triple eigenvalue by eps^(1/3).
 GROUP_DISTANCES = (1e-6, 1e-4, 1e-2)
@@ -28,7 +29,7 @@ def distance_from_circle(first: Any, second: Any) -> float:
 
     Both: an ``arb_mat (n, n)``, of which every member is meant.
     """
-    matrices = _floats(first.tolist()), _floats(second.tolist())
+    matrices = middles(first), middles(second)
     if not all(np.all(np.isfinite(matrix)) for matrix in matrices):
         return 0.0
     try:
@@ -54,30 +55,27 @@ def distance_from_circle(first: Any, second: Any) -> float:
     return 0.0
 
 
-def _floats(table: list[list[Any]]) -> FloatArray:
-    return np.array([[float(entry.mid()) for entry in row] for row in table]).reshape(len(table), -1)
-
-
 def _nearest(first: Any, second: Any, x: ComplexArray, y: ComplexArray) -> float:
     size = len(x)
     left, right = (flint.acb_mat(size, size, part.ravel().tolist()) for part in (y, x))
     tables = [(left * (flint.acb_mat(part) * right)).tolist() for part in (first, second)]
     centres = [abs(abs(tables[0][i][i]) - abs(tables[1][i][i])).lower() for i in range(size)]
     zero = flint.arb(0)
-    others = [
-        [zero if i == j else a.abs_upper() + b.abs_upper() for j, (a, b) in enumerate(zip(*rows, strict=True))]
-        for i, rows in enumerate(zip(*tables, strict=True))
+    rows = [
+        [zero if i == j else a.abs_upper() + b.abs_upper() for j, (a, b) in enumerate(zip(*pair, strict=True))]
+        for i, pair in enumerate(zip(*tables, strict=True))
     ]
+    others = flint.arb_mat(rows)
     distances = np.array([float(centre) for centre in centres])
     # The equation of an M-matrix: its solution is positive where any weights do.
     try:
-        weights = np.linalg.solve(np.diag(distances) - _floats(others), distances)
+        weights = np.linalg.solve(np.diag(distances) - middles(others), distances)
     except np.linalg.LinAlgError:
         return 0.0
     if not np.all(np.isfinite(weights)) or not np.all(weights > 0.0):
         return 0.0
     column = flint.arb_mat(size, 1, weights.tolist())
-    beside = flint.arb_mat(others) * column
+    beside = others * column
     nearest = min(float((centres[i] - beside[i, 0] / column[i, 0]).lower()) for i in range(size))
     return nearest if 0.0 < nearest < np.inf else 0.0
 

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.standard_form import cayley, cayley_point
 from obsynth.proofs.definiteness import DefinitenessProof, unproved
-from obsynth.proofs.extended_balls import ExtendedBall, arb_matrix, block, undecided_pivot
+from obsynth.proofs.extended_balls import ExtendedBall, arb_matrix, block, middles, undecided_pivot
 from obsynth.proofs.regular_pencils import distance_from_circle
 from obsynth.verification.inequalities import NO_GAIN, System
 
@@ -53,8 +53,7 @@ def _in_reached_units(system: System, dt: float) -> tuple[tuple[Any, Any, Any, A
     Any coordinates give the same proof: in these a nearly is a contraction.
     """
     a, b, c, d = (part.content for part in system(ExtendedBall))
-    middle_a, middle_b = (np.array([[float(x.mid()) for x in row] for row in part.tolist()]) for part in (a, b))
-    middle_b = middle_b.reshape(len(middle_a), -1)
+    middle_a, middle_b = middles(a), middles(b)
     alpha = 0.0 if dt > 0.0 else cayley_point(np.linalg.eigvals(middle_a))
     if alpha:
         nothing = np.zeros((0, len(middle_a))), np.zeros((0, middle_b.shape[1]))

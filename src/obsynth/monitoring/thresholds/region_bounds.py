@@ -62,11 +62,8 @@ def region_bound(
     Without ``initial_error`` there is no table: the bound holds once the effect of the start has settled.
     """
     errors, model, bounds = _errors_at_vertices(design, disturbance_bounds, noise_bound)
-    return (
-        _bound(errors, _lyapunov_matrices(design, errors), design.certificate.claims["region_decay"], initial_error),
-        (model),
-        bounds,
-    )
+    P, decay = _lyapunov_matrices(design, errors), design.certificate.claims["region_decay"]
+    return _bound(errors, P, decay, initial_error), model, bounds
 
 
 def _errors_at_vertices(

@@ -40,7 +40,7 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
         running, _ = shipped.advance(running, y[k], u[k])
         reference, _ = stated.advance(reference, y[k], u[k])
     exact, largest = _solved(stated, y, u)
-    made_of = _terms(stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
+    made_of = _terms(stated, stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
     covariance = exact.factor @ exact.factor.T
     size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
     shipped_covariance = running.factor @ running.factor.T
@@ -58,7 +58,10 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
 
 
 def _terms(
-    step: StepMatrices, before: tuple[FloatArray, FloatArray, FloatArray], data: tuple[FloatArray, ...]
+    observer: RecursiveObserver,
+    step: StepMatrices,
+    before: tuple[FloatArray, FloatArray, FloatArray],
+    data: tuple[FloatArray, ...],
 ) -> FloatArray:
     """Return the terms of deviation and regressor ``(nx, 1 + nq)``: what tends to zero rounds as they do."""
     (x, factor, upsilon), (y, u, after) = before, data
@@ -68,8 +71,8 @@ def _terms(
     nq = upsilon.shape[1]
     regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
     # A parameter that is read where no state is has a regressor of zero, but for the rounding of that row's datum.
-    rows = np.max(np.abs(np.hstack([step.H, step.noise])), axis=1, keepdims=True)
-    regressors += ROUNDED_BESIDE * rows * np.max(regressors / np.where(rows > 0.0, rows, 1.0), axis=0, initial=0.0)
+    rows = _row_sizes(observer, step.H, step.noise)[:, None]
+    regressors += ROUNDED_BESIDE * rows * np.max(regressors / rows, axis=0, initial=0.0)
     return state_terms(step, np.hstack([values[:, None], regressors]))
 
 
