@@ -192,10 +192,10 @@ SCHEMA = [
     Case("infinity in C", put("plant", "C", 0, 0, -math.inf), "plant.C: row 1, column 1 must be a finite number"),
     Case("huge whole number in A", put("plant", "A", 0, 0, 10**400), "plant.A: row 1, column 1 must be a number"),
     Case("ragged A", put("plant", "A", 2, [1, 2]), "plant.A: row 3 has 2 entries, but row 1 has 4"),
-    Case("A as one row", put("plant", "A", [1, 2]), "plant.A: row 1 must be a list of numbers"),
+    Case("A as one row", put("plant", "A", [1, 2]), "plant.A: must be a list of rows"),
     Case("A as a number", put("plant", "A", 1), "plant.A: must be a list of rows"),
     Case("A with zero rows", put("plant", "A", []), "plant.A: must be a list of rows"),
-    Case("A with an empty row", put("plant", "A", [[]]), "plant.A: row 1 must be a list of numbers"),
+    Case("A with an empty row", put("plant", "A", [[]]), "plant.A: must be a list of rows"),
     Case("Bf with zero rows", put("plant", "Bf", []), "plant.Bf: must be a list of rows"),
     Case(
         "names that are numbers",

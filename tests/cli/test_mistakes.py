@@ -153,7 +153,7 @@ def test_a_transposed_matrix_is_asked_about_before_the_names_that_it_takes_away(
     path.write_text(text.replace(outputs, "[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]"), encoding="utf-8")
     with pytest.raises(obsynth.SpecError) as raised:
         obsynth.load_spec(path)
-    assert "C is 4 by 3, but 4 by 4 is needed. Is it transposed?" in raised.value.problems[0]
+    assert "C is 4 by 3, but 3 by 4 is needed. Is it transposed?" in raised.value.problems[0]
 
 
 def test_what_is_given_instead_of_a_plant_or_a_method_is_named() -> None:

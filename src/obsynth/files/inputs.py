@@ -24,6 +24,9 @@ MOST_DOCUMENT_CHARACTERS = 32_000_000
 #: How alike the name of a file must be to one that may be meant, as `difflib` measures it.
 CLOSE_NAME = 0.75
 
+#: A folder with more specs is not asked about: the question would be longer than the answer.
+MOST_FILES_NAMED = 3
+
 #: What the readers of numpy and scipy raise for a damaged file.
 READING_ERRORS = (
     OSError,
@@ -119,12 +122,21 @@ def _similar_files(path: Path) -> str:
     return f" Did you mean {' or '.join(str(path.parent / name) for name in close)}?" if close else ""
 
 
+def _files_inside(folder: Path) -> str:
+    """Return a question with the specs in a folder, where there are few; empty else."""
+    try:
+        specs = sorted(entry for entry in folder.iterdir() if entry.suffix in (".yaml", ".yml") and entry.is_file())
+    except OSError:
+        return ""
+    return f" Did you mean {' or '.join(map(str, specs))}?" if 0 < len(specs) <= MOST_FILES_NAMED else ""
+
+
 def input_file(path: Path, *, where: str | None = None, is_protected: bool = True) -> Path:
     """Return ``path`` if it is a regular file, and protect it; anything else is a `SpecError` at ``where``."""
     place = where or str(path)
     try:
         if path.is_dir():
-            raise SpecError(f"{path} is a folder: give the name of a file.", path=place)
+            raise SpecError(f"{path} is a folder: give the name of a file.{_files_inside(path)}", path=place)
         if not path.exists():
             raise SpecError(f"{path} does not exist.{_similar_files(path)}", path=place)
         kind = special_kind(path)

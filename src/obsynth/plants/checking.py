@@ -81,16 +81,29 @@ def picked_names(value: Any) -> tuple[str, ...] | None:
     return tuple(value) if is_name_list(value) else None
 
 
-def signal_counts(matrices_by_name: Mapping[str, FloatArray | None]) -> dict[str, int]:
-    """Return the number of signals of each kind, from the first matrix that tells."""
+def signal_counts(matrices_by_name: Mapping[str, FloatArray | None], nx: int) -> dict[str, int]:
+    """Return the number of signals of each kind of a plant with ``nx`` states, from the first matrix that has some.
+
+    Where only the transpose of this matrix fits the states, its rows count: the transposed matrix alone is refused."""
 
     def columns(*names: str) -> int:
-        matrices = (matrices_by_name.get(name) for name in names)
-        return next((m.shape[1] for m in matrices if m is not None and 0 not in m.shape), 0)
+        shapes = [
+            (name, matrix.shape)
+            for name in names
+            if (matrix := matrices_by_name.get(name)) is not None and 0 not in matrix.shape
+        ]
+        if not shapes:
+            return 0
+        name, (rows, width) = shapes[0]
+        is_transposed = name.startswith("B") and len(shapes) == 1 and rows != nx == width
+        return int(rows if is_transposed else width)
 
     outputs = matrices_by_name.get("C")
     counts = {signal: columns(*names) for signal, names in COUNTED_BY.items()}
-    return counts | {"y": 0 if outputs is None else outputs.shape[0]}
+    if outputs is None:
+        return counts | {"y": 0}
+    rows, width = outputs.shape
+    return counts | {"y": width if width != nx == rows else rows}
 
 
 def checked_dt(dt: Any) -> float:

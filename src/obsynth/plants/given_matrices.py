@@ -136,7 +136,7 @@ def plant_fields(
         if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
             checked[name] = problems.collect(partial(matrix_or_picks, value, name, states))
     more = _appended(matrices, labels, checked, sensor_noise, problems)
-    sizes = {"x": nx, **signal_counts(checked)}
+    sizes = {"x": nx, **signal_counts(checked, nx)}
     # What depends on a matrix that could not be read is not judged: its own message is enough.
     broken = {name for name, value in matrices.items() if value is not None and checked.get(name) is None}
     unknown = {
@@ -200,7 +200,7 @@ def _appended(
     names = labels["output_names"]
     stated = picked_names(matrices["C"]) if names is None else names
     outputs = problems.collect(
-        lambda: checked_names(stated, signal_counts(fields)["y"], prefix="y", what="output_names")
+        lambda: checked_names(stated, signal_counts(fields, _size(fields))["y"], prefix="y", what="output_names")
     )
     problems.raise_if_any()
     picked = problems.collect(lambda: _with_sensor_picks(matrices, fields, outputs)) or {}

@@ -14,6 +14,15 @@ from obsynth.files.inputs import read_json, read_text
 from obsynth.methods.registry import AUTO, REGISTRY, method_class
 from obsynth.numerics.arguments import field_types, is_whole
 from obsynth.plants.signal_names import suggestion
+from obsynth.specs.lines import composed, line_of
+from obsynth.specs.remedies import (
+    instead_of_key,
+    instead_of_list,
+    instead_of_matrix,
+    instead_of_number,
+    instead_of_time,
+    is_matlab,
+)
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -39,6 +48,9 @@ _KIND = re.compile(r"<\w+>")
 
 #: Problems of a value that is of another kind, beside those whose names end with `_type`.
 _OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
+
+#: Files that are given for a spec, by their endings.
+_OTHER_LANGUAGES = {".toml": "TOML", ".py": "Python", ".m": "MATLAB", ".ini": "an INI file", ".txt": "a text"}
 
 #: Of a long line so many characters are shown around the place of an error.
 SHOWN_COLUMNS = 100
@@ -73,8 +85,12 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
     if document is None:
         raise SpecError(f"{path} is empty.", path=place)
     if not isinstance(document, dict):
+        other = _OTHER_LANGUAGES.get(path.suffix.lower())
+        hint = (
+            f" {path.name} is {other}, and a spec is YAML or JSON: write key: value, not key = value." if other else ""
+        )
         raise SpecError(
-            f"{path} holds {described(document)}: the top level must be a mapping (key: value).", path=place
+            f"{path} holds {described(document)}: the top level must be a mapping (key: value).{hint}", path=place
         )
     return document
 
@@ -152,6 +168,8 @@ def _one_line(error: Exception) -> str:
     problem = getattr(error, "problem", None) or str(error).strip().splitlines()[0]
     # The reader adds what it has of the values, which is empty where they are mappings.
     problem = re.sub(r"\bbut got\b", "but found", str(problem))
+    if "'\\t' that cannot start any token" in problem:
+        problem = "a line is indented by a tab, and YAML takes blanks only: write two blanks instead"
     problem = re.sub(r"^(found duplicate key .*?) with value .*", r"\1", str(problem), flags=re.DOTALL)
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
@@ -164,29 +182,43 @@ class DocumentProblems:
 
     source: Path
     what: str
+    document: Any = None
     noted: list[tuple[str, str]] = field(default_factory=list)
+    places: dict[str, tuple[str | int, ...]] = field(default_factory=dict)
 
-    def add(self, path: str, text: str) -> None:
-        """Note that ``text`` is wrong at ``path``."""
+    def add(self, path: str, text: str, location: Sequence[str | int] = ()) -> None:
+        """Note that ``text`` is wrong at ``path``; ``location``: its keys, and numbers of entries, one by one."""
         if (path, text) not in self.noted:
             self.noted.append((path, text))
+            self.places[f"{path}: {text}"] = tuple(location) or tuple(path.split("."))
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with everything noted, if anything was."""
         if not self.noted:
             return
-        lines = [f"{path}: {text}" if path else text for path, text in self.noted]
+        lines = self._numbered([f"{path}: {text}" if path else text for path, text in self.noted])
         if len(lines) > MAXIMUM_PROBLEMS:
             lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
         head = f"{self.source} is not a valid {self.what}:"
         raise SpecError(head, path=self.noted[0][0] or str(self.source), problems=lines)
+
+    def _numbered(self, problems: Sequence[str]) -> list[str]:
+        """Return problems with the line of the file that each is about, unless the document was changed after reading
+        it: what is wrong may then be no part of the file."""
+        tree = composed(self.source)
+        changed = tree is None or (self.document is not None and self.document != read_yaml(self.source))
+        lines = [None if changed else line_of(tree, self.places.get(problem, ())) for problem in problems]
+        return [
+            problem if line is None else f"{problem} [line {line}]"
+            for line, problem in zip(lines, problems, strict=True)
+        ]
 
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
     from obsynth.specs.schema_values import options_schema
 
-    problems = DocumentProblems(source, what="spec")
+    problems = DocumentProblems(source, what="spec", document=document)
     _check_version(document, problems)
     checked = _checked_sections(document, problems)
     method = document.get("method", {"id": AUTO})
@@ -258,7 +290,7 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | T
     """Check a plant in a file of its own."""
     from obsynth.specs.schema import RARE_KINDS, plant_document
 
-    problems = DocumentProblems(source, what="plant")
+    problems = DocumentProblems(source, what="plant", document=document)
     _check_version(document, problems)
     kind = document.get("kind")
     known = plant_document(kind if kind in RARE_KINDS else None)
@@ -289,7 +321,7 @@ def _validated(model: type[Model], document: Any, problems: DocumentProblems, *,
         return model.model_validate(document)
     except ValidationError as error:
         for item in _of_likely_kinds(error.errors(include_url=False), document):
-            problems.add(*_explained(item, model, prefix))
+            problems.add(*_explained(item, model, prefix, document, problems.source.parent))
         return None
 
 
@@ -349,8 +381,11 @@ def _kind_wanted(item: Any) -> str:
     return _wanted_in_words(item["type"], item.get("ctx", {})).removeprefix("one of ")
 
 
-def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
-    """Return the path and the message of one of pydantic's errors."""
+def _explained(
+    item: Any, model: type[BaseModel], prefix: str, document: Any, folder: Path
+) -> tuple[str, str, tuple[str | int, ...]]:
+    """Return the path, the message and the location of one of pydantic's errors in a document, or in the part of it at
+    ``prefix``; ``folder`` is that of the file."""
     location = [part for part in item["loc"] if not (isinstance(part, str) and re.fullmatch(r"<\w+>", part))]
     names = [str(part) for part in location if isinstance(part, str) and part != "[key]"]
     numbers = [part + 1 for part in location if isinstance(part, int)]
@@ -362,10 +397,15 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "extra_forbidden":
         known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
-        text = f"unknown key.{suggestion(key, known) or _option_hint(key, prefix, names, known)}"
+        beside = _value_at(document, location[:-1])
+        beside = list(beside) if isinstance(beside, dict) else []
+        meant = instead_of_key(key, known, beside) or _option_hint(key, prefix, names, known)
+        text = f"unknown key.{meant or _plant_hint(key, prefix, names)}"
     elif kind == "missing":
         needed = ": give the seconds between samples, or 0 for a plant in continuous time"
-        needed = {"dt": needed, "schema_version": ": write schema_version: 1"}.get(key, "")
+        needed = {"dt": needed, "schema_version": ": write schema_version: 1", "name": ": write name: my-design"}.get(
+            key, ""
+        )
         text = f"this key is missing{needed}."
     elif kind in ("ragged_rows", "stack_shapes"):
         text = f"{item['msg']}."
@@ -373,8 +413,10 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = item["msg"]
     elif kind == "finite_number":
         text = f"must be a finite number, not {value}."
-    elif kind in ("entry_of_k", "time"):
+    elif kind == "entry_of_k":
         text = f"{item['msg']}, not {described(value)}."
+    elif kind == "time":
+        text = f"{item['msg']}, not {described(value)}.{instead_of_time(value)}"
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
     else:
@@ -383,12 +425,42 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         )
         expected = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else expected
         actual = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+        if kind == "list_of_no_rows":
+            actual = "a list of empty rows" if [] in value else "a list of numbers"
         text = f"must be {expected}, not {actual}."
-        if location == ["method"] and isinstance(value, str):
-            text += f" Write method: {{id: {value}}}."
+        text += _remedy(kind, key, value, folder, in_rows=in_rows, is_entry=bool(numbers))
     words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
     place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
-    return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
+    path = ".".join([*([prefix] if prefix else []), *names])
+    return path, f"{place} {text}" if place else text, (*filter(None, prefix.split(".")), *location)
+
+
+def _remedy(kind: str, key: str, value: Any, folder: Path, *, in_rows: bool, is_entry: bool) -> str:
+    """Return what to write instead of a value of a wrong kind, as a sentence after a blank; empty where none is known.
+
+    ``in_rows``: the value is a matrix, or with ``is_entry`` a row or an entry of one."""
+    if key == "method":
+        return f" Write method: {{id: {value}}}." if isinstance(value, str) else ""
+    if in_rows and not (is_entry and kind == "float_type"):
+        return instead_of_matrix(key, value, folder) if not is_entry or is_matlab(value) else ""
+    if kind == "float_type":
+        return instead_of_number(value)
+    return instead_of_list(key, value) if kind == "list_type" else ""
+
+
+def _value_at(document: Any, location: Sequence[str | int]) -> Any:
+    """Return what is at a location of a document; ``None`` where nothing is."""
+    value = document
+    for part in location:
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
+
+
+def _plant_hint(key: str, prefix: str, names: Sequence[str]) -> str:
+    """Return where a key belongs that is one of a plant, but is written beside it."""
+    from obsynth.specs.schema_plants import PlantSection
+
+    return " It belongs below plant." if not prefix and len(names) == 1 and key in PlantSection.model_fields else ""
 
 
 def _option_hint(key: str, prefix: str, names: Sequence[str], known: Sequence[str]) -> str:
@@ -431,6 +503,7 @@ def _wanted_in_words(kind: str, context: Mapping[str, Any]) -> str:
         "dict_type": "a mapping (key: value)",
         "model_type": "a mapping (key: value)",
         "too_short": "a list with at least one entry",
+        "list_of_no_rows": "a list of rows",
     }
     return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
 

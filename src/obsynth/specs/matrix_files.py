@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.files.inputs import READING_ERRORS, input_file
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import MAXIMUM_ENTRIES, FloatArray, as_matrix, read_only, require_readable
@@ -29,6 +29,22 @@ ENTRIES_PER_LINE = 1000
 
 #: Whole numbers with more digits are damage.
 MOST_DIGITS = 15
+
+#: Endings of files that hold matrices.
+MATRIX_SUFFIXES = (".csv", ".mat", ".mtx", ".npz")
+
+#: What to do with matrices in other common files.
+_CONVERSIONS = {
+    ".npy": "save it by numpy.savez, as .npz",
+    ".txt": "name it .csv",
+    ".tsv": "name it .csv",
+    ".dat": "name it .csv",
+    ".xlsx": "save the sheet as .csv",
+    ".xls": "save the sheet as .csv",
+}
+
+#: What separates the numbers of a row of a text, in the order in which they are tried; else blanks do.
+_SEPARATORS = (";", "\t", ",")
 
 
 def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_sparse: bool = False) -> Any:
@@ -72,13 +88,17 @@ def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bo
     """Return what a file holds as an array of any kind, or as a sparse one."""
     readers: dict[str, Callable[[Path], Any]] = {
         ".mtx": partial(read_matrix_market, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse),
-        ".csv": partial(np.loadtxt, delimiter=",", ndmin=2, encoding="utf-8-sig"),
+        ".csv": read_table_of_numbers,
     }
     archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
     suffix = path.suffix.lower()
     if suffix not in readers and suffix not in archives:
-        known = ", ".join(sorted([*readers, *archives]))
-        raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
+        known, advice = ", ".join(MATRIX_SUFFIXES), _CONVERSIONS.get(suffix)
+        raise SpecError(
+            f"{path.name} has an unknown suffix: matrices are read from {known} files{f' ({advice})' if advice else ''}"
+            ".",
+            path=where,
+        )
     if variable is not None and suffix in readers:
         raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
     input_file(path, where=where)
@@ -135,6 +155,51 @@ def _reason(error: BaseException) -> str:
         return f"{error.strerror}."
     text = str(error).strip().splitlines()
     return f"{text[0].rstrip('.')}." if text else f"{type(error).__name__}."
+
+
+def read_table_of_numbers(path: Path) -> FloatArray:
+    """Return the matrix in a text, a row a line, its numbers separated by commas, semicolons, tabs or blanks.
+
+    Numbers may have a decimal comma where semicolons or tabs separate them and no number has a point.  What follows
+    ``#`` in a line is a remark.  `ValueError` names the line and column of what is no number."""
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    rows = [(i, text) for i, line in enumerate(lines, 1) if (text := line.partition("#")[0].strip(" \r\n"))]
+    if not rows:
+        raise ValueError("it is empty")
+    separator = next((mark for mark in _SEPARATORS if mark in rows[0][1]), None)
+    has_decimal_comma = separator not in (None, ",") and not any("." in text for _, text in rows)
+    texts = [text.replace(",", ".") if has_decimal_comma else text for _, text in rows]
+    try:
+        return np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
+    except ValueError as error:
+        width = len(texts[0].split(separator))
+        for row, ((line, _), text) in enumerate(zip(rows, texts, strict=True)):
+            cells = text.split(separator)
+            if len(cells) != width or not all(map(_is_number, cells)):
+                raise ValueError(_damage_in_row(line, cells, width, is_first=row == 0)) from error
+        raise
+
+
+def _damage_in_row(line: int, cells: list[str], width: int, *, is_first: bool) -> str:
+    """Return what is wrong with a line of a table of numbers, and what to do."""
+    wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
+    if is_first and len(wrong) == len(cells):
+        return f"line {line} holds names ({cells[0].strip()[:20]!r}), and only numbers are read: remove this line"
+    if not wrong:
+        return f"line {line} has {counted(len(cells), 'number')}, but the first row has {width}"
+    cell = cells[wrong[0]].strip()
+    if not cell:
+        remedy = ": remove the separator at the end of the line" if wrong == [len(cells) - 1] else ""
+        return f"line {line}, column {wrong[0] + 1} is empty{remedy}"
+    return f"line {line}, column {wrong[0] + 1} holds {cell[:20]!r}, which is no number"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number_in_text(text)
+    except ValueError:
+        return False
+    return True
 
 
 def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:

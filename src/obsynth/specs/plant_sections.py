@@ -22,6 +22,7 @@ from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.results.calibration_files import read_calibration
 from obsynth.specs.documents import DocumentProblems, read_names
+from obsynth.specs.lines import composed, line_of
 from obsynth.specs.matrix_files import read_matrices, read_matrix
 
 if TYPE_CHECKING:
@@ -68,11 +69,10 @@ def _placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
     try:
         return make()
     except SpecError as error:
-        raise SpecError(
-            f"{source}: {error.args[0].splitlines()[0]}",
-            path=joined(prefix, error.path or ""),
-            problems=error.problems,
-        ) from error
+        path = joined(prefix, error.path or "")
+        line = line_of(composed(source), path.split("."))
+        place = source if line is None or error.problems else f"{source}, line {line}"
+        raise SpecError(f"{place}: {error.args[0].splitlines()[0]}", path=path, problems=error.problems) from error
 
 
 def joined(prefix: str, name: str) -> str:

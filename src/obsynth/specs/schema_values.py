@@ -89,7 +89,10 @@ Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
-    """Check that rows have one length, besides their entries, so that both kinds of problem are reported."""
+    """Check that rows have one length, besides their entries, so that both kinds of problem are reported; a flat list
+    of numbers, and one of empty rows, are one problem each."""
+    if isinstance(rows, list) and rows and (all(map(is_number, rows)) or all(row == [] for row in rows)):
+        raise PydanticCustomError("list_of_no_rows", "must be a list of rows")
     listed = [(i, len(row)) for i, row in enumerate(rows, 1) if isinstance(row, list)] if isinstance(rows, list) else []
     ragged = next(((i, length) for i, length in listed if length != listed[0][1]), None)
     if ragged is None:

@@ -1,0 +1,126 @@
+"""What to write in a spec instead of a value, or a key, that it does not take: sentences for messages, after a blank.
+
+Every sentence names the text to write; it is empty where none is certain.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
+from obsynth.plants.signal_names import suggestion
+from obsynth.specs.matrix_files import MATRIX_SUFFIXES
+
+#: Names by which books, Simulink and other libraries call what a spec calls otherwise.
+OTHER_NAMES = {
+    **dict.fromkeys(("Ts", "ts", "T", "h", "sample_time", "sampling_time", "time_step", "step", "period"), "dt"),
+    **dict.fromkeys(("F", "Ba", "E_f", "Ef"), "Bf"),
+    **dict.fromkeys(("Bv", "Ed", "E_d"), "Bd"),
+    **dict.fromkeys(("G", "Gamma"), "Bw"),
+    **dict.fromkeys(("states", "x"), "state_names"),
+    **dict.fromkeys(("outputs", "sensors", "y"), "output_names"),
+    **dict.fromkeys(("inputs", "u"), "input_names"),
+    **dict.fromkeys(("faults", "f"), "fault_names"),
+}
+
+#: Matrices that every plant has.
+NEEDED_MATRICES = ("A", "C")
+
+#: Texts by which other programs write an identity.
+_IDENTITIES = ("I", "eye", "identity", "Identity")
+
+#: Matrices that may be given by names of signals, the key for these, and what they name.
+_PICKS = {
+    **dict.fromkeys(("B", "Bf", "Bd", "Bw"), ("states", "equations")),
+    **dict.fromkeys(("C", "Df", "Dd"), ("outputs", "outputs")),
+}
+
+#: A matrix with at most this many numbers is written out in a message.
+LARGEST_EXAMPLE = 12
+
+
+def instead_of_key(key: str, known: Sequence[str], present: Sequence[str] = ()) -> str:
+    """Return which key may be meant: one by another name, or one that is written alike; ``present`` are there."""
+    other = OTHER_NAMES.get(key)
+    if other in known and other not in present:
+        return f" Did you mean {other!r}?"
+    return suggestion(key, known)
+
+
+def instead_of_number(value: Any) -> str:
+    """Return the number that a text stands for: in quotes, a fraction or formula, with a decimal comma."""
+    number = number_of(value)
+    return "" if number is None else f" Write {number!r}."
+
+
+def number_of(value: Any) -> float | None:
+    """Return the finite number that a text of one number without names stands for; ``None`` where it is none."""
+    from obsynth.numerics.expressions import parse_expression
+
+    if not isinstance(value, str):
+        return None
+    text = value.strip()
+    for written in (text, text.replace(",", "."), text.replace("D", "e").replace("d", "e")):
+        try:
+            expression = parse_expression(written)
+            number = float(expression({"pi": math.pi}))
+        except (SpecError, KeyError, ValueError, TypeError, ArithmeticError):
+            continue
+        if math.isfinite(number):
+            return number
+    return None
+
+
+def instead_of_matrix(key: str, value: Any, folder: Path) -> str:
+    """Return how a matrix is written that was given as a text, a single number, a flat list, or an empty one;
+    ``folder`` is that of the spec."""
+    if isinstance(value, list):
+        if value and all(map(is_number, value)) and len(value) <= LARGEST_EXAMPLE:
+            return f" Write {[value]} for one row, {[[entry] for entry in value]} for one column."
+        is_empty = all(isinstance(row, list) and not row for row in value)
+        return f" Leave {key} out if there is none." if is_empty and key not in NEEDED_MATRICES else ""
+    if is_number(value):
+        return f" Write {key}: [[{value!r}]] for a matrix of one entry."
+    return _instead_of_text(key, value.strip(), folder) if isinstance(value, str) else ""
+
+
+def _instead_of_text(key: str, text: str, folder: Path) -> str:
+    if Path(text).suffix.lower() in MATRIX_SUFFIXES:
+        missing = "" if (folder / text).is_file() else f" {text} is not in the folder of the spec."
+        return f" Write {key}: {{file: {text}}} for a matrix in a file.{missing}"
+    if text.partition("(")[0] in _IDENTITIES:
+        default = "Leave E out: it is the identity then." if key == "E" else "Write the identity out, row by row."
+        return f" {default}"
+    if key in _PICKS and re.fullmatch(r"[^\W\d][\w .-]*", text):
+        kind, meaning = _PICKS[key]
+        return f" Write {key}: {{{kind}: [{text}]}} for {meaning} by name."
+    rows = [row.replace(",", " ").split() for row in text.strip("[]").split(";")]
+    numbers = [[number_of(entry) for entry in row] for row in rows]
+    complete = all(numbers) and all(number is not None for row in numbers for number in row)
+    few = sum(map(len, numbers)) <= LARGEST_EXAMPLE
+    return f" Write {key}: {numbers}." if complete and few and len(set(map(len, numbers))) == 1 else ""
+
+
+def is_matlab(value: Any) -> bool:
+    """Whether a text is a matrix with its rows separated by semicolons, as MATLAB writes them."""
+    return isinstance(value, str) and ";" in value
+
+
+def instead_of_list(key: str, value: Any) -> str:
+    """Return a name that is alone as a list of it."""
+    return f" Write {key}: [{value}]." if isinstance(value, str) and "," not in value else ""
+
+
+def instead_of_time(value: Any) -> str:
+    """Return a time that was given as a frequency or a fraction, in seconds."""
+    text = value.strip() if isinstance(value, str) else ""
+    for unit, factor in (("kHz", 1e3), ("Hz", 1.0)):
+        rate = number_of(text.removesuffix(unit)) if text.endswith(unit) else None
+        if rate:
+            return f" Write {1.0 / (rate * factor)!r} for a period of {text}."
+    return instead_of_number(value)
