@@ -77,7 +77,7 @@ def test_of_one_state_the_sum_is_the_series():
     for a in (0.5, 0.9, 0.97):
         contraction = prove_contraction(a * one, discrete=True)
         for left in (1e-3, 0.3, 10.0):
-            found = peak_sums(Ball.exact(a * one), one, Ball.exact(one), contraction, left=left)
+            found = peak_sums(Ball.exact(a * one), one, Ball.exact(one), contraction, relative_remainder=left)
             assert 1.0 / (1.0 - a) * (1.0 - 1e-15) <= found[1][0] <= 1.2 / (1.0 - a)
 
 

@@ -20,7 +20,7 @@ from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.plants.transformations.elimination import dynamic_coordinates
 from obsynth.proofs import contraction
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import LEFT_OF_SUM, prove_contraction, proved_contractions
+from obsynth.proofs.contraction import REMAINDER_OF_SUM, prove_contraction, proved_contractions
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.verification import inequalities, stored_numbers
 
@@ -61,7 +61,7 @@ def test_bounds_are_found_again_with_another_factor_of_the_lyapunov_equation(
     assert not [row.name for row in again.failures]
     row = again["stored numbers: states"]
     # The room is what rounding can do and where a sum may end, and not a share that somebody chose.
-    assert 0.999 * row.bound / (1.0 + LEFT_OF_SUM) <= row.value <= row.bound
+    assert 0.999 * row.bound / (1.0 + REMAINDER_OF_SUM) <= row.value <= row.bound
     assert np.all(np.isfinite(shipped))
 
 

@@ -78,12 +78,12 @@ def aligned(cells: Sequence[str]) -> list[str]:
     ]
 
 
-def text_table(rows: Sequence[Sequence[str]], *, left: int | None = None) -> list[str]:
-    """Return the lines of a table; its columns, or the first ``left`` of them, begin at the left, others end right."""
+def text_table(rows: Sequence[Sequence[str]], *, left_aligned: int | None = None) -> list[str]:
+    """Return the lines of a table: columns begin at the left, all or the first ``left_aligned``, others end right."""
     head, *body = rows
     rows = [head, *zip(*(aligned(column) for column in zip(*body, strict=True)), strict=True)] if body else rows
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
-    count = len(widths) if left is None else left
+    count = len(widths) if left_aligned is None else left_aligned
     placed = (
         [cell.ljust(w) if j < count else cell.rjust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))]
         for row in rows

@@ -234,8 +234,8 @@ def _decoupling_window(
 def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:
     """Return the fewest samples after which a long window shows each fault: rows that the outputs' rows span."""
     count = selection.shape[1]
-    left = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th - np.eye(th.shape[1])
-    newest_first = [selection @ left[i : i + count] for i in reversed(range(0, len(left), count))]
+    residual = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th - np.eye(th.shape[1])
+    newest_first = [selection @ residual[i : i + count] for i in reversed(range(0, len(residual), count))]
     missed = np.array([np.linalg.norm(part, axis=1) for part in newest_first])
     return np.asarray(np.argmax(missed <= WINDOW_IDENTITY, axis=0))
 

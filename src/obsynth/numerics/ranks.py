@@ -254,15 +254,15 @@ def rank_from(
     reference = scale if scale is not None else (float(values[0]) if values.size else 0.0)
     rank = int(np.count_nonzero(values > tolerance * reference)) if reference > 0.0 else 0
     relative = values / reference if reference > 0.0 else values
-    kept = float(relative[rank - 1]) if rank else 0.0
+    smallest_kept = float(relative[rank - 1]) if rank else 0.0
     dropped = float(relative[rank]) if rank < values.size else 0.0
     if rank == values.size:
-        gap = kept / tolerance if rank else float("inf")
+        gap = smallest_kept / tolerance if rank else float("inf")
     elif dropped == 0.0:
         gap = float("inf")
     else:
-        gap = (kept if rank else tolerance) / dropped
-    return RankDecision(rank, expected, read_only(np.asarray(values, dtype=np.float64)), kept, gap)
+        gap = (smallest_kept if rank else tolerance) / dropped
+    return RankDecision(rank, expected, read_only(np.asarray(values, dtype=np.float64)), smallest_kept, gap)
 
 
 def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:

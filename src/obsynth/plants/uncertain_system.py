@@ -168,8 +168,8 @@ def _with_tolerances(
     entries = {name: list(items) for name, items in before.entries.items()}
     stated = {key: value for key, value in options.items() if value is not None}
     variation = constants.variation if isinstance(constants, ConstantsBox) else before.box.variation
-    kept = {"variation": variation, **_kept_source(before.box, constants, stated), **stated}
-    box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept)
+    box_options = {"variation": variation, **_kept_source(before.box, constants, stated), **stated}
+    box, more = _boxed(constants, tolerance, before.box.constants, written, entries, box_options)
     after = replace(before, box=box, entries=_joined(entries, more))
     _require_used(after, set(box.constants))
     moved = [
@@ -196,16 +196,16 @@ def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -
         return {}
     if box.source != "calibrated":
         return {"source": box.source}
-    left = tuple(name for name in box.calibrated or box.constants if name not in (constants or {}))
+    unchanged = tuple(name for name in box.calibrated or box.constants if name not in (constants or {}))
     return (
         {
             "source": "calibrated",
             "level": box.level,
             "digest": box.digest,
-            "calibrated": left,
+            "calibrated": unchanged,
             "calibration": box.calibration,
         }
-        if left
+        if unchanged
         else {}
     )
 

@@ -72,7 +72,7 @@ _LARGEST_DEFECT = 0.5
 
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
-MOST_SUMMED_STEPS, LEFT_OF_SUM = 65_536, 1e-3
+MOST_SUMMED_STEPS, REMAINDER_OF_SUM = 65_536, 1e-3
 
 #: Steps that are taken together; what is left is looked at when their number has grown by one in so many.
 STEPS_AT_ONCE, LOOKS = 64, 8

@@ -18,11 +18,11 @@ from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_onl
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
 from obsynth.proofs.contraction import (
-    LEFT_OF_SUM,
     LOOKS,
     MOST_PIECES,
     MOST_SUMMED_STEPS,
     NORM_PIECE,
+    REMAINDER_OF_SUM,
     STEPS_AT_ONCE,
     Contraction,
 )
@@ -36,7 +36,7 @@ LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
 
 #: Share of such a gain that the rest may have, and most steps towards it: what it bounds is a rounding, and slow modes
 #: would take a hundred thousand.
-LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
+REMAINDER_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 #: Most steps for given columns, where another machine's bound is to be found again, whatever its contraction was.
 MOST_STEPS_OF_COLUMNS = 2_048
@@ -49,7 +49,7 @@ def peak_sums(
     contraction: Contraction,
     *,
     least: int = 0,
-    left: float = LEFT_OF_SUM,
+    relative_remainder: float = REMAINDER_OF_SUM,
     each: bool = False,
     most: int = MOST_SUMMED_STEPS,
 ) -> tuple[FloatArray, FloatArray]:
@@ -57,7 +57,7 @@ def peak_sums(
 
     A column per input: on terms ``0 .. k``, ``(steps, ..., m)``, and on all of them, ``(..., m)``.
 
-    From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``left``.
+    From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``relative_remainder``.
     """
     moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
     driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
@@ -79,7 +79,7 @@ def peak_sums(
             )
             after = np.asarray(after * sizes)
             # A column that is nothing but its radius has no terms to compare with.
-            if done or np.all((after <= left * total) | idle):
+            if done or np.all((after <= relative_remainder * total) | idle):
                 break
     every = np.concatenate(terms)
     count = len(every) + 8
@@ -188,7 +188,7 @@ def absolute_gains(
     """Return upper bounds on ``sum_j |c A^j b|`` (the integral of ``|c e^{A t} b|``), for ``c (p, n)``: ``(p, m)``.
 
     ``b`` are the unit vectors, or ``columns (n, m)``.  Bounds hang on the contraction by what is left of the sum alone:
-    where it settles, by `LEFT_OF_GAINS` at most, of given columns by `LEFT_OF_SUM`."""
+    where it settles, by `REMAINDER_OF_GAINS` at most, of given columns by `REMAINDER_OF_SUM`."""
     if columns is not None:
         return _absolute_gains(a, rows, contraction, columns)
     # The same sums are asked for on the way to several rows of a report.
@@ -212,10 +212,17 @@ def _absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction, c
     loose = contraction.gain(rows, into.midpoint, into.radius)
     if not loose.size or not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
         return loose
-    left, most = (LEFT_OF_SUM, MOST_STEPS_OF_COLUMNS) if has_columns else (LEFT_OF_GAINS, MOST_STEPS_OF_GAINS)
+    relative_remainder, most = (
+        (REMAINDER_OF_SUM, MOST_STEPS_OF_COLUMNS) if has_columns else (REMAINDER_OF_GAINS, MOST_STEPS_OF_GAINS)
+    )
     if contraction.discrete:
         return np.asarray(
-            np.minimum(loose, peak_sums(Ball.exact(a), rows, into, contraction, left=left, each=True, most=most)[1])
+            np.minimum(
+                loose,
+                peak_sums(
+                    Ball.exact(a), rows, into, contraction, relative_remainder=relative_remainder, each=True, most=most
+                )[1],
+            )
         )
     length = LENGTH / _natural_norm(a)
     gather = interval_pieces(a, into.midpoint, Ball.exact(np.eye(n)), length)
@@ -224,7 +231,15 @@ def _absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction, c
     if not rate < 1.0:
         return loose
     sampled = replace(contraction, rate=rate, discrete=True)
-    sums = peak_sums(exponential(a, length), rows, gather.columns, sampled, left=left, each=True, most=most)[1]
+    sums = peak_sums(
+        exponential(a, length),
+        rows,
+        gather.columns,
+        sampled,
+        relative_remainder=relative_remainder,
+        each=True,
+        most=most,
+    )[1]
     bounds = gathered(gather, sums, loose.shape[1])
     if has_columns and into.radius.any():
         bounds = rounded_up(bounds + contraction.gain(rows, np.zeros_like(into.radius), into.radius), 2)

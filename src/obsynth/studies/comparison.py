@@ -529,7 +529,7 @@ class Comparison:
         return low - room, high + room
 
     def __repr__(self) -> str:
-        table = text_table(self.rows(), left=2)
+        table = text_table(self.rows(), left_aligned=2)
         return "\n".join(
             [self.setting, *self.notes, *table, self.meanings(), *self.beside_the_least, *self.refusals, self.advice]
         )

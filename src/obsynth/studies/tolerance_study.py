@@ -153,7 +153,7 @@ class ToleranceStudy:
         return write_atomically(path, text)
 
     def __repr__(self) -> str:
-        return "\n".join([*text_table(self.rows(), left=2), self.conclusion])
+        return "\n".join([*text_table(self.rows(), left_aligned=2), self.conclusion])
 
 
 def study_statement(result: Mapping[str, Any], options: Mapping[str, Any], digest: str) -> str:

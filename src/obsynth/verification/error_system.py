@@ -297,9 +297,11 @@ class ErrorModel:
             return remainder
         # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
         ball = _as_ball(driven)
-        left = np.where(_there(ball), ball.magnitude, 0.0)
-        added = left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)
-        return replace(remainder, J=Ball(remainder.J.midpoint, remainder.J.radius + added)) if left.any() else remainder
+        leakage = np.where(_there(ball), ball.magnitude, 0.0)
+        added = leakage if observer.dt > 0.0 else np.where(leakage > 0.0, np.inf, 0.0)
+        return (
+            replace(remainder, J=Ball(remainder.J.midpoint, remainder.J.radius + added)) if leakage.any() else remainder
+        )
 
     @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -335,14 +337,14 @@ class ErrorModel:
         inputs = size(observer.Bu) + by @ d + t @ size(self.B), size(observer.Du) + dy @ d + t0 @ size(self.B)
         disturbances = by @ dd + t @ size(self.Bd), dy @ dd + t0 @ size(self.Bd)
         shares = [
-            float(np.max(size(left.midpoint) * units / terms, initial=0.0))
-            for left, terms in zip((channel.K, channel.J), rows, strict=True)
+            float(np.max(size(balls.midpoint) * units / terms, initial=0.0))
+            for balls, terms in zip((channel.K, channel.J), rows, strict=True)
         ]
-        for left, terms in (((channel.U, channel.L), inputs), ((channel.W, channel.V), disturbances)):
+        for balls, terms in (((channel.U, channel.L), inputs), ((channel.W, channel.V), disturbances)):
             # Each signal in the unit in which it moves some row by its largest terms.
             missed, moved = (
                 np.vstack([part / row for part, row in zip(parts, rows, strict=True)])
-                for parts in ([size(part.midpoint) for part in left], terms)
+                for parts in ([size(part.midpoint) for part in balls], terms)
             )
             scale = np.max(moved, axis=0, initial=0.0)
             shares.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))

@@ -202,8 +202,8 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
             except ZeroDivisionError:
                 continue
         if bound is not None:
-            left = bound * (1.0 - LIMIT_SHARE)
-            return left if LONGEST_DELAY * math.log(abs(point)) <= LIMIT_SHARE / 2.0 else None
+            lower_bound = bound * (1.0 - LIMIT_SHARE)
+            return lower_bound if LONGEST_DELAY * math.log(abs(point)) <= LIMIT_SHARE / 2.0 else None
     return None
 
 
@@ -394,12 +394,12 @@ def worst_ratio(error: Any, noise: Any, level: float | None, enough: float | Non
     # Energies of the basis differ by many orders: each member in its own unit, without those that only rounding has.
     sizes = [(noise[i, i].real + error[i, i].real).mid() for i in range(count)]
     nothing = max(sizes) * flint.arb(2) ** -(flint.ctx.prec // 2)
-    kept = [i for i, size in enumerate(sizes) if size > nothing]
-    if not kept:
+    significant = [i for i, size in enumerate(sizes) if size > nothing]
+    if not significant:
         return None
-    units = [(1 / flint.acb(sizes[i]).sqrt()).mid() for i in kept]
+    units = [(1 / flint.acb(sizes[i]).sqrt()).mid() for i in significant]
     error, noise = (
-        _scaled(_scaled(_columns(_rows(part, kept), kept), units).transpose(), units).transpose()
+        _scaled(_scaled(_columns(_rows(part, significant), significant), units).transpose(), units).transpose()
         for part in (error, noise)
     )
     largest, combination = _largest_ratio(error, noise)

@@ -45,21 +45,21 @@ def as_it_runs(observer: LinearObserver) -> LinearObserver:
     return sample_observer(observer, SAMPLES_PER_TIME_CONSTANT / fastest)
 
 
-def rounding_in_operation(observer: LinearObserver, kept: np.ndarray, y: FloatArray, z: FloatArray) -> FloatArray:
+def rounding_in_operation(observer: LinearObserver, states: np.ndarray, y: FloatArray, z: FloatArray) -> FloatArray:
     """Return bounds on what rounding adds to the fault estimates at any sample, ``(nf, m)``; infinite without a proof.
 
-    ``kept``: the states that reach a fault estimate; ``y (ny, m)`` and ``z (kept, m)``: the sizes of the outputs and of
+    ``states``: those that reach a fault estimate; ``y (ny, m)`` and ``z (states, m)``: the sizes of the outputs and of
     these states, at least."""
     rows = observer.fault_rows
-    cz, dy = np.abs(observer.Cz[rows][:, kept]), np.abs(observer.Dy[rows])
-    count = len(kept) + dy.shape[1] + observer.Bu.shape[1] + OTHER_ROUNDINGS
+    cz, dy = np.abs(observer.Cz[rows][:, states]), np.abs(observer.Dy[rows])
+    count = len(states) + dy.shape[1] + observer.Bu.shape[1] + OTHER_ROUNDINGS
     unit = float(gamma(count))
-    if not len(kept):
+    if not len(states):
         return rounded_up(unit * (dy @ y), 2 * count)
     part = observer
-    if len(kept) < observer.order:
-        parts = {"By": observer.By[kept], "Bu": observer.Bu[kept], "Cz": observer.Cz[:, kept]}
-        part = replace(observer, Az=observer.Az[np.ix_(kept, kept)], **parts)
+    if len(states) < observer.order:
+        parts = {"By": observer.By[states], "Bu": observer.Bu[states], "Cz": observer.Cz[:, states]}
+        part = replace(observer, Az=observer.Az[np.ix_(states, states)], **parts)
     az, by = np.abs(part.Az), np.abs(part.By)
     contraction, entries = contraction_of(part), inverse_bound(az)
     unknown = np.full((len(cz), y.shape[1]), np.inf)

@@ -21,7 +21,7 @@ from obsynth.observers.linear.modes import modes_of, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.pencil import structure_of
 from obsynth.proofs.balls import rounded_up
-from obsynth.proofs.contraction import LEFT_OF_SUM, proved_contractions
+from obsynth.proofs.contraction import REMAINDER_OF_SUM, proved_contractions
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import BOTH_BALLS, ByNumbers, ErrorModel, RemainderChannel, contraction_of
@@ -92,7 +92,7 @@ class StoredErrors:
             return None
         room = np.full((len(model.observer.Cz), 1), 1.0 + min(contraction.roundings, MOST_ROOM))
         # Sums that another machine takes closely are no larger, whichever term these end at.
-        room[model.observer.fault_rows] *= 1.0 + LEFT_OF_SUM
+        room[model.observer.fault_rows] *= 1.0 + REMAINDER_OF_SUM
         return cls(model.remainder, bounds, room if model.is_evaluated_exactly else BOTH_BALLS * room)
 
     def witnesses(self) -> dict[str, FloatArray]:
@@ -360,8 +360,10 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
         return "the plant is stable: a finite gain exists", np.inf
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))
-        left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))
-        seconds = min(seconds, float(np.log(max(level / max(left, SMALLEST), 1.0)) / rate))
+        largest_remainder = max(
+            float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0))
+        )
+        seconds = min(seconds, float(np.log(max(level / max(largest_remainder, SMALLEST), 1.0)) / rate))
         return (
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"

@@ -175,11 +175,11 @@ def _on_real_coefficients(energy: ComplexArray, points: ComplexArray) -> FloatAr
 def _largest(error: FloatArray, noise: FloatArray) -> tuple[float, FloatArray] | None:
     """Return the root of the largest ratio of two energies and its coefficients; the error's has few directions."""
     sizes = np.diag(error) + np.diag(noise)
-    kept = np.flatnonzero(sizes > 0.0)
-    if not kept.size or not np.all(np.isfinite(sizes)):
+    present = np.flatnonzero(sizes > 0.0)
+    if not present.size or not np.all(np.isfinite(sizes)):
         return None
-    units = 1.0 / np.sqrt(sizes[kept])
-    error, noise = (units[:, None] * part[np.ix_(kept, kept)] * units for part in (error, noise))
+    units = 1.0 / np.sqrt(sizes[present])
+    error, noise = (units[:, None] * part[np.ix_(present, present)] * units for part in (error, noise))
     factor = _factor(noise)
     lower, order, rank, _ = scipy.linalg.lapack.dpstrf(error, lower=1)
     roots = np.zeros((len(error), rank))
@@ -191,7 +191,7 @@ def _largest(error: FloatArray, noise: FloatArray) -> tuple[float, FloatArray] |
     if not rank or values[-1] <= 0.0:
         return None
     whole = np.zeros(len(sizes))
-    whole[kept] = units * scipy.linalg.solve_triangular(factor, scaled @ vectors[:, -1], lower=True, trans="T")
+    whole[present] = units * scipy.linalg.solve_triangular(factor, scaled @ vectors[:, -1], lower=True, trans="T")
     return float(np.sqrt(values[-1])), whole
 
 

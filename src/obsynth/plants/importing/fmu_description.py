@@ -72,13 +72,13 @@ def require_linear_meaning(
             if v.causality == "output" and (v.type not in REAL_TYPES or v.variability == "discrete")
         ],
     }
-    left = {"inputs": "keep the values that they start with", "outputs": "are left out"}
+    consequences = {"inputs": "keep the values that they start with", "outputs": "are left out"}
     for what, picked in (("inputs", inputs), ("outputs", outputs)):
         if picked is None and strange[what]:
             names = ", ".join(v.name if v.type in REAL_TYPES else f"{v.name} ({v.type})" for v in strange[what])
             raise SpecError(
                 f"{path}: its {what} {names} are no continuous real numbers, and a linear model has no such signal: "
-                f"name those that it shall have by {what}=[...]; the others {left[what]}.",
+                f"name those that it shall have by {what}=[...]; the others {consequences[what]}.",
                 path=what,
             )
         for variable in strange[what]:

@@ -221,9 +221,9 @@ class _Problem:
         directions, signals = [], []
         for row in null:
             moved = row * self.sizes
-            kept = [i for i in np.argsort(-np.abs(row)) if abs(row[i]) > NAMED * np.abs(row).max()]
-            signals += [self.names[i] for i in kept]
-            directions.append("(" + ", ".join(f"{self.names[i]}: {moved[i]:.4g}" for i in kept) + ")")
+            named = [i for i in np.argsort(-np.abs(row)) if abs(row[i]) > NAMED * np.abs(row).max()]
+            signals += [self.names[i] for i in named]
+            directions.append("(" + ", ".join(f"{self.names[i]}: {moved[i]:.4g}" for i in named) + ")")
         return PreconditionError(
             f"The equilibrium is not unique: {len(self.names)} unknowns and {len(self.names) - len(null)} conditions. "
             f"Nothing determines the direction {', '.join(directions)}: give the value of one of these.",
@@ -236,9 +236,9 @@ class _Problem:
         if not largest > 0.0:
             return [], ""
         shares = weights / weights[int(np.argmax(np.abs(weights)))]
-        kept = [i for i in range(len(shares)) if abs(shares[i]) > NAMED]
-        terms = [("" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * ") + self.rows[i] for i in kept]
-        return [self.rows[i] for i in kept], " + ".join(terms)
+        named = [i for i in range(len(shares)) if abs(shares[i]) > NAMED]
+        terms = [("" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * ") + self.rows[i] for i in named]
+        return [self.rows[i] for i in named], " + ".join(terms)
 
 
 def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ()) -> Point:
@@ -277,10 +277,10 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
     move = np.zeros(E.shape[1])
     if not constraint.size:
         return move
-    for first, kept in ((True, (np.abs(E).max(axis=0) == 0.0) & movable), (False, movable)):
+    for first, columns in ((True, (np.abs(E).max(axis=0) == 0.0) & movable), (False, movable)):
         if first or np.abs(constraint @ move - right).max() > ROOT_RESIDUAL * max(1.0, np.abs(right).max()):
             move = np.zeros(E.shape[1])
-            move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
+            move[columns] = np.linalg.lstsq(constraint[:, columns], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
     return move
 
 

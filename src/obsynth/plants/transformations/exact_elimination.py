@@ -60,15 +60,15 @@ class ExactElimination:
     def numbers(self, sizes: Mapping[str, FloatArray], *, own: bool) -> ExactNumbers:
         """Return those of the reduced plant, with the sizes of the terms in its coordinates; ``own``: these ones."""
         matrices: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
-        kept = {name: sizes[name] for name in DECISIVE if name in sizes}
-        known = all(np.all(np.isfinite(part)) for part in kept.values())
+        decisive_sizes = {name: sizes[name] for name in DECISIVE if name in sizes}
+        known = all(np.all(np.isfinite(part)) for part in decisive_sizes.values())
         exact = {name: fractions_of(matrices[name]) for name in DECISIVE}
         before = None if self.uncleaned is None else {"E": matrices["E"], **self.uncleaned}
         return ExactNumbers(
             exact,
             own=own,
             computed=self.computed,
-            sizes=kept if known else None,
+            sizes=decisive_sizes if known else None,
             states=int(self.recovery["A"].nrows()),
             uncleaned=None if before is None else {name: fractions_of(before[name]) for name in DECISIVE},
         )
@@ -205,8 +205,8 @@ def _sum(direct: fmpq_mat, factor: fmpq_mat, solution: fmpq_mat, *, clean: bool)
 
 def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
     rows, columns = size_of_terms.shape
-    kept = _sizes(result) > CANCELLATION_TOLERANCE * size_of_terms
-    entries = [result[i, j] if kept[i, j] else fmpq(0) for i in range(rows) for j in range(columns)]
+    significant = _sizes(result) > CANCELLATION_TOLERANCE * size_of_terms
+    entries = [result[i, j] if significant[i, j] else fmpq(0) for i in range(rows) for j in range(columns)]
     return fmpq_mat(rows, columns, entries)
 
 

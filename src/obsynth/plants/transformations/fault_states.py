@@ -54,8 +54,8 @@ def _augmented(uncertain: Uncertainty, nx: int, chosen: Sequence[int]) -> Uncert
     entries = {name: list(items) for name, items in uncertain.entries.items()}
     direct = entries.pop("Df", [])
     moved = [(row, nx + chosen.index(column), text) for row, column, text in direct if column in chosen]
-    kept = {"C": [*entries.get("C", []), *moved], "Df": [item for item in direct if item[1] not in chosen]}
-    return replace(uncertain, entries={name: tuple(items) for name, items in {**entries, **kept}.items() if items})
+    changed = {"C": [*entries.get("C", []), *moved], "Df": [item for item in direct if item[1] not in chosen]}
+    return replace(uncertain, entries={name: tuple(items) for name, items in {**entries, **changed}.items() if items})
 
 
 def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Sequence[str]) -> None:

@@ -82,7 +82,7 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
     if not len(kept_columns):
         # No output sees anything: what is wrong with the plant is not that some variable acts on nothing.
         return everything_active(plant)
-    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
+    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), active) for active in (kept_columns, kept_rows))
     names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
     return ActiveVariables(kept_rows, kept_columns, names, numbers)
 
@@ -124,8 +124,8 @@ def _say_nothing(plant: DescriptorSystem, rows: Indices, scale: FloatArray, comb
     scaled = csr(scipy.sparse.diags_array(scale) @ scipy.sparse.hstack(everything))
     peaks = np.zeros(scaled.shape[1])
     np.maximum.at(peaks, scaled.indices, np.abs(scaled.data))
-    left = np.abs(scaled.T @ combinations)
-    return bool(np.all(left <= RANK_TOLERANCE * peaks[:, None] * np.max(np.abs(combinations), axis=0, initial=0.0)))
+    combined = np.abs(scaled.T @ combinations)
+    return bool(np.all(combined <= RANK_TOLERANCE * peaks[:, None] * np.max(np.abs(combinations), axis=0, initial=0.0)))
 
 
 def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
@@ -246,10 +246,10 @@ def settled_basis(directions: FloatArray) -> FloatArray:
     Singular vectors of values that are equal are any, and so is every sign: another machine would make another plant.
     This one is the pivoted Cholesky factor of the projection, in few digits: any basis that E tells apart will do.
     """
-    left, columns = directions @ directions.T, []
+    remainder, columns = directions @ directions.T, []
     for _ in range(directions.shape[1]):
-        sizes = np.diag(left)
+        sizes = np.diag(remainder)
         first = int(np.flatnonzero(sizes >= EQUAL_LENGTHS * np.max(sizes))[0])
-        columns.append(left[:, first] / np.sqrt(sizes[first]))
-        left = left - np.outer(columns[-1], columns[-1])
+        columns.append(remainder[:, first] / np.sqrt(sizes[first]))
+        remainder = remainder - np.outer(columns[-1], columns[-1])
     return np.asarray(np.ldexp(np.round(np.ldexp(np.array(columns).T, BASIS_DIGITS)), -BASIS_DIGITS))

@@ -340,8 +340,8 @@ def _over_box(
                 entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in items)]
         linear = with_shift(linear, shift)
     uncertainty = Uncertainty(box, {name: tuple(items) for name, items in entries.items()}, shift=shift)
-    kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
-    return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
+    used = {name: item for name, item in box.constants.items() if name in uncertainty.used}
+    return filled_plant(linear, uncertainty.with_box(replace(box, constants=used)), set(used))
 
 
 def _names(value: Sequence[str] | Mapping[str, tuple[float, float]], what: str) -> list[str]:

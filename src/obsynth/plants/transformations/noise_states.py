@@ -145,14 +145,14 @@ def _of_matrices(
     # In continuous time rates, in discrete time what a sample keeps.
     times = np.array([noise.correlation for noise in coloured.values()])
     sizes = np.array([noise.deviation for noise in coloured.values()])
-    kept = np.exp(-own.dt / times) if own.is_discrete else -1.0 / times
-    drives = sizes * (np.sqrt(1.0 - kept**2) if own.is_discrete else np.sqrt(2.0 / times))
-    keeps = np.concatenate([kept, np.full(len(offsets) + len(loads), 1.0 if own.is_discrete else 0.0)])
+    decays = np.exp(-own.dt / times) if own.is_discrete else -1.0 / times
+    drives = sizes * (np.sqrt(1.0 - decays**2) if own.is_discrete else np.sqrt(2.0 / times))
+    keeps = np.concatenate([decays, np.full(len(offsets) + len(loads), 1.0 if own.is_discrete else 0.0)])
     driven = np.concatenate([drives, [walk for _, walk in offsets.values()], list(loads.values())])
     dynamics, outputs = np.zeros((nx, count)), np.zeros((ny, count))
     for column, name in enumerate((*coloured, *offsets)):
         outputs[own.output_names.index(name), column] = 1.0
-    moved, left = _columns_of(own, loads)
+    moved, other_columns = _columns_of(own, loads)
     for column, (matrix, direct, i) in enumerate(moved, len(coloured) + len(offsets)):
         dynamics[:, column], outputs[:, column] = getattr(own, matrix)[:, i], getattr(own, direct)[:, i]
 
@@ -167,18 +167,18 @@ def _of_matrices(
         A=A,
         C=np.hstack([own.C, outputs]),
         B=below(own.B),
-        Bf=below(own.Bf[:, left["Bf"]]),
-        Df=own.Df[:, left["Bf"]],
-        Bd=below(own.Bd[:, left["Bd"]]),
-        Dd=own.Dd[:, left["Bd"]],
+        Bf=below(own.Bf[:, other_columns["Bf"]]),
+        Df=own.Df[:, other_columns["Bf"]],
+        Bd=below(own.Bd[:, other_columns["Bd"]]),
+        Dd=own.Dd[:, other_columns["Bd"]],
         Bw=np.hstack([below(own.Bw), np.vstack([np.zeros((nx, count)), np.diag(driven)])]),
         Dw=np.hstack([own.Dw, np.zeros((ny, count))]),
         state_names=(*own.state_names, *names),
-        fault_names=[own.fault_names[i] for i in left["Bf"]],
-        disturbance_names=[own.disturbance_names[i] for i in left["Bd"]],
+        fault_names=[own.fault_names[i] for i in other_columns["Bf"]],
+        disturbance_names=[own.disturbance_names[i] for i in other_columns["Bd"]],
         noise_names=(*own.noise_names, *(f"drive of {name}" for name in names)),
         units={**own.units, **_units(own.units, dict(zip(names, (*coloured, *offsets, *loads), strict=True)))},
-        uncertainty=_carried(own, moved, left, len(coloured) + len(offsets)),
+        uncertainty=_carried(own, moved, other_columns, len(coloured) + len(offsets)),
     )
     new = new.replace(sensor_noise=white) if white else new
     spread = np.array([*sizes, *(size for size, _ in offsets.values()), *np.ones(len(loads))])
@@ -200,17 +200,17 @@ def _columns_of(
         if not homes:
             index_of(name, (*plant.disturbance_names, *plant.fault_names), what="walks")
         moved.append(homes[0])
-    left = {
+    other_columns = {
         matrix: [i for i in range(len(names)) if not any(item[0] == matrix and item[2] == i for item in moved)]
         for matrix, (_, names) in known.items()
     }
-    return moved, left
+    return moved, other_columns
 
 
 def _carried(
     plant: DescriptorSystem,
     moved: Sequence[tuple[str, str, int]],
-    left: Mapping[str, list[int]],
+    other_columns: Mapping[str, list[int]],
     first: int,
 ) -> Uncertainty | None:
     """Return what is uncertain in a plant with further states: entries of the columns of loads are then of A and C."""
@@ -222,15 +222,15 @@ def _carried(
     entries = {name: list(items) for name, items in uncertain.entries.items()}
     for matrix, target in (("Bd", "A"), ("Bf", "A"), ("Dd", "C"), ("Df", "C")):
         beside = matrix.replace("D", "B")
-        kept = []
+        unmoved = []
         for row, column, text in entries.pop(matrix, []):
             places = [i for i, item in enumerate(moved) if (item[0], item[2]) == (beside, column)]
             if places:
                 entries.setdefault(target, []).append((row, plant.nx + first + places[0], text))
             else:
-                kept.append((row, left[beside].index(column), text))
-        if kept:
-            entries[matrix] = kept
+                unmoved.append((row, other_columns[beside].index(column), text))
+        if unmoved:
+            entries[matrix] = unmoved
     return replace(uncertain, entries={name: tuple(items) for name, items in entries.items()})
 
 

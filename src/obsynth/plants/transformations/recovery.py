@@ -80,8 +80,8 @@ class StateRecovery:
             through = operator.then(
                 {signal: getattr(later, name) for name, signal in _RECOVERED_SIGNALS.items()}, later.noise_kept
             )
-            kept = self.noise_kept @ later.noise_kept
-            return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
+            source_noise = self.noise_kept @ later.noise_kept
+            return StateRecovery.from_operator(self.names, through, source_noise, self.operating_point)
         step = self.from_state
         own = {
             "from_input": self.from_input,
@@ -142,9 +142,9 @@ def unchanged_states(
 ) -> StateRecovery:
     """Return the recovery of a transformation that adds no direct effect of any signal on the states."""
     inputs, faults, disturbances, noise = (np.zeros((source.nx, n)) for n in (new.nu, new.nf, new.nd, new.nw))
-    kept = np.eye(source.nw) if noise_kept is None else noise_kept
+    source_noise = np.eye(source.nw) if noise_kept is None else noise_kept
     point = state_point(source)
-    return StateRecovery(source.state_names, from_state, inputs, faults, disturbances, noise, kept, point)
+    return StateRecovery(source.state_names, from_state, inputs, faults, disturbances, noise, source_noise, point)
 
 
 def state_point(plant: DescriptorSystem) -> dict[str, float]:

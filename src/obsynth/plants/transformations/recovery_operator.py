@@ -73,8 +73,8 @@ class RecoveryOperator:
             if name != "state":
                 own = matrix @ noise_kept if name == "noise" else matrix
                 states[name] = states.get(name, np.zeros_like(own)) + own
-        kept = noise_kept if self.noise_kept is None else self.noise_kept @ noise_kept
-        return replace(self, states=states, noise_kept=kept)
+        source_noise = noise_kept if self.noise_kept is None else self.noise_kept @ noise_kept
+        return replace(self, states=states, noise_kept=source_noise)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data: the parts of the sparse matrices as arrays."""

@@ -126,12 +126,12 @@ def _first_independent(units: FloatArray, count: int) -> list[int]:
 def _most_independent(units: FloatArray, count: int) -> list[int]:
     """Return ``count`` rows, each with the most that those before leave of it; of rows alike the first, whatever
     rounding does."""
-    left, picked = units, list[int]()
+    remainder, picked = units, list[int]()
     for _ in range(count):
-        sizes = np.linalg.norm(left, axis=1)
+        sizes = np.linalg.norm(remainder, axis=1)
         place = int(np.flatnonzero(sizes >= (1.0 - ALIKE) * np.max(sizes))[0])
-        direction = left[place] / sizes[place]
-        left = left - np.outer(left @ direction, direction)
+        direction = remainder[place] / sizes[place]
+        remainder = remainder - np.outer(remainder @ direction, direction)
         picked.append(place)
     return sorted(picked)
 

@@ -121,9 +121,9 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
     transition, held = _held(smooth.A, signals_in, sample_time)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
     factor = gathered_noise(smooth.A, smooth.Bw, sample_time)
-    kept = [smooth.noise_names[i] for i in direct]
-    noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
-    Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
+    direct_names = [smooth.noise_names[i] for i in direct]
+    noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *direct_names]
+    Bw = np.hstack([factor, np.zeros((smooth.nx, len(direct_names)))])
     Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
     changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
     exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= EXACT_ELIMINATION_UP_TO else None
@@ -188,5 +188,5 @@ def gathered_noise(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     spread = power_of_two_below(np.sqrt(np.abs(np.diag(covariance))))
     correlation = covariance / spread / spread[:, None]
     sizes, directions = np.linalg.eigh((correlation + correlation.T) / 2.0)
-    kept = sizes > CANCELLATION_TOLERANCE * sizes[-1]
-    return np.asarray((scale * spread)[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))
+    significant = sizes > CANCELLATION_TOLERANCE * sizes[-1]
+    return np.asarray((scale * spread)[:, None] * directions[:, significant] * np.sqrt(sizes[significant]))

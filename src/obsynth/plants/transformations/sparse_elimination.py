@@ -166,11 +166,11 @@ class _Pieces:
         self._put(self.dynamic_rows, self.algebraic_rows, rows, left.T * row_scale, rank, whole=whole_rows)
         self._put(self.dynamic, self.algebraic, columns, right * column_scale, rank, whole=whole_columns)
 
-    def _put(self, kept: Any, others: Any, places: Any, basis: FloatArray, rank: int, *, whole: bool) -> None:
+    def _put(self, target: Any, others: Any, places: Any, basis: FloatArray, rank: int, *, whole: bool) -> None:
         if whole:
-            kept += [(int(place), np.array([place]), np.ones(1)) for place in places]
+            target += [(int(place), np.array([place]), np.ones(1)) for place in places]
             return
-        kept += [(int(places[0]), places, basis[k]) for k in range(rank)]
+        target += [(int(places[0]), places, basis[k]) for k in range(rank)]
         others += [(int(places[0]), places, basis[k]) for k in range(rank, len(places))]
 
     def rest(self, rows: Any, columns: Any) -> None:

@@ -136,10 +136,10 @@ def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
     untouched = [j for j in range(n) if not acting[n:, j].any()]
     while True:
         others = [i for i in range(n) if i not in untouched]
-        kept = [j for j in untouched if not acting[others, j].any()]
-        if kept == untouched:
+        untouched_by_others = [j for j in untouched if not acting[others, j].any()]
+        if untouched_by_others == untouched:
             return untouched
-        untouched = kept
+        untouched = untouched_by_others
 
 
 def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
@@ -220,8 +220,8 @@ def reduced_matrices(
         top = (affine_inverse((e @ dynamic)[state, :]) @ top).after(back)
         ahead = AffineMatrix.exact(np.eye(nd), count)
     else:
-        left = back @ np.linalg.inv((rows @ divided_by @ dynamic)[state])
-        top, ahead = top.after(left), (e @ (dynamic @ v))[state, :].after(left)
+        solved = back @ np.linalg.inv((rows @ divided_by @ dynamic)[state])
+        top, ahead = top.after(solved), (e @ (dynamic @ v))[state, :].after(solved)
     like = {
         "A": AffineMatrix.exact(np.zeros((nd, nd)), count),
         **{k: matrices[k] for k in (*_INPUT_MATRICES, *_DIRECT)},

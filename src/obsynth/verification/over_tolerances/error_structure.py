@@ -132,8 +132,8 @@ def error_structure(
         disturbances = _with_more(disturbances, 1)
         offsets = np.append(offsets, 0.0)
     parts, rest = _about_nominal(state, offsets)
-    rows, effects, owner, left = _channels(parts, offsets)
-    rest = rounded_up(rest + left, 3)
+    rows, effects, owner, neglected = _channels(parts, offsets)
+    rest = rounded_up(rest + neglected, 3)
     more, single, remainders = _remainder_channels(rest, sizes)
     input_parts, input_rest = _about_nominal(known, offsets)
     return ErrorStructure(
@@ -270,7 +270,7 @@ def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArra
 def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
     """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
     rows_count, n = parts.shape[1:]
-    rows, effects, owner, left = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
+    rows, effects, owner, neglected = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
     for i, part in enumerate(parts):
         columns = np.flatnonzero(np.abs(part).sum(axis=0) > 0.0)
         if not len(columns):
@@ -283,11 +283,11 @@ def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Float
             b, c = u[:, :rank] * values[:rank], v[:rank]
             c = np.where(np.abs(c) < EFFECT_RANK_SHARE, 0.0, c)
             missed = np.abs(part - b @ c) + gamma(2 * rank + 4) * (np.abs(b) @ np.abs(c))
-            left += (1.0 + abs(offsets[i])) * missed
+            neglected += (1.0 + abs(offsets[i])) * missed
         rows.append(c)
         effects.append((1.0 + abs(offsets[i])) * b)
         owner += [i] * len(c)
-    return np.vstack(rows), np.hstack(effects), owner, rounded_up(left, len(parts) + 4)
+    return np.vstack(rows), np.hstack(effects), owner, rounded_up(neglected, len(parts) + 4)
 
 
 def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray, int, FloatArray]:

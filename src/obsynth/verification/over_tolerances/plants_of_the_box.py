@@ -145,12 +145,14 @@ def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     while len(powers) <= _GAIN_BLOCK:
         powers.append(a @ powers[-1])
     block, onwards = np.array(powers[:-1]), powers[-1]
-    column, left, total = b, _GAIN_REMAINDER * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
+    column, negligible, total = b, _GAIN_REMAINDER * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
     for _ in range(0, MOST_GAIN_SAMPLES, _GAIN_BLOCK):
         moved = block @ column
         sizes = np.abs(moved).max(axis=(1, 2), initial=0.0)
-        total = total + np.abs(c @ moved[: max(int(np.argmax(np.append(sizes <= left, True))), 1)]).sum(axis=(0, 2))
-        if np.any(sizes <= left):
+        total = total + np.abs(c @ moved[: max(int(np.argmax(np.append(sizes <= negligible, True))), 1)]).sum(
+            axis=(0, 2)
+        )
+        if np.any(sizes <= negligible):
             break
         column = onwards @ column
     return total
