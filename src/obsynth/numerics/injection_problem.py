@@ -24,6 +24,7 @@ from obsynth.numerics.norms import (
     spectral_radius,
     state_units,
 )
+from obsynth.numerics.ranks import decide_rank
 
 #: Slack of the bounded real matrix that normalises, relative to the squared norm of what is shown.
 NORMALISING_SLACK = 1e-6
@@ -235,7 +236,7 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
     states = _natural_states(a, b, z, zd, NORMALISING_LEVEL * size)
     inverse = np.linalg.inv(states)
     c = problem.C @ states
-    measurements = _orthonormalising(c) if problem.measured else np.zeros((0, 0))
+    measurements = _orthonormalising(c, problem.D / size) if problem.measured else np.zeros((0, 0))
     # With P near I in units of gain^2: B is scaled by 1/gain, and x by the root of P.
     limit = problem.weight_limit
     changed = replace(
@@ -253,9 +254,11 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
     return NormalisedProblem(changed, states, measurements, size, start, gain)
 
 
-def _orthonormalising(c: FloatArray) -> FloatArray:
-    """Return the inverse of the Cholesky factor of ``c c'`` without that product, which loses rows in other units."""
-    factor = np.linalg.qr(c.T, mode="r")
+def _orthonormalising(c: FloatArray, d: FloatArray) -> FloatArray:
+    """Return the inverse of the Cholesky factor of ``c c'`` without that product, which loses rows in other units; of
+    ``c c' + d d'`` where some measurement shows disturbances alone."""
+    shown = c if decide_rank(c, expected=len(c)).full else np.hstack([c, d])
+    factor = np.linalg.qr(shown.T, mode="r")
     return np.asarray(np.linalg.inv((np.copysign(1.0, np.diag(factor))[:, None] * factor).T))
 
 

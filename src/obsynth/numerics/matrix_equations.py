@@ -43,12 +43,22 @@ def discrete_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def continuous_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, **others: Any) -> FloatArray:
-    """Return SciPy's solution of ``a' X + X a - X b r^-1 b' X + q = 0``, with its ``e`` and ``s``."""
+    """Return SciPy's solution of ``a' X + X a - X b r^-1 b' X + q = 0``, with its ``e`` and ``s``.
+
+    Without columns of b, of which SciPy takes one at least, it is that of the linear equation.
+    """
+    if b.shape[1] == 0:
+        return continuous_lyapunov(a.T, -q)
     return _by_rows(scipy.linalg.solve_continuous_are, a, b, q, r, **others)
 
 
 def discrete_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, **others: Any) -> FloatArray:
-    """Return SciPy's solution of ``a' X a - X - a' X b (r + b' X b)^-1 b' X a + q = 0``, with its ``e`` and ``s``."""
+    """Return SciPy's solution of ``a' X a - X - a' X b (r + b' X b)^-1 b' X a + q = 0``, with its ``e`` and ``s``.
+
+    Without columns of b, of which SciPy takes one at least, it is that of the linear equation.
+    """
+    if b.shape[1] == 0:
+        return discrete_lyapunov(a.T, q)
     return _by_rows(scipy.linalg.solve_discrete_are, a, b, q, r, **others)
 
 

@@ -270,12 +270,13 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
             signals=error.signals,
         )
         return
-    # Sensor faults are states then, and their columns of Df stand beside C.
+    # Sensor faults are states then, and their columns of Df stand beside C.  An output that shows disturbances alone
+    # repeats no other one: it measures these.
     direct = {"Df": np.flatnonzero(plant.Df.any(axis=0)).tolist()}
-    outputs, states = FullRank([["C", "Df"]], direct, of_rows=True), FullRank([["E", None], ["C", "Df"]], direct)
+    outputs, states = FullRank([["C", "Df", "Dd"]], direct, of_rows=True), FullRank([["E", None], ["C", "Df"]], direct)
 
     def repeated(matrix: FloatArray) -> tuple[str, tuple[str, ...]]:
-        names = leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES)
+        names = leading_names(np.linalg.svd(matrix)[0][:, -1], plant.output_names, most=MOST_NAMES)
         return "some outputs repeat others: leave them out.", names
 
     def unknown(matrix: FloatArray) -> tuple[str, tuple[str, ...]]:
@@ -286,7 +287,8 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
         )
         return text, names
 
-    yield judge.full_rank("rank C", outputs, repeated, source=source)
+    name = "rank [C Dd]" if plant.Dd.any() else "rank C"
+    yield judge.full_rank(name, outputs, repeated, source=source)
     yield judge.full_rank("rank [E; C]", states, unknown, source="Wang 2015, eq. (2)")
 
 

@@ -120,7 +120,7 @@ def _gain_set_rows(
     equations = Equations.of(plant, work, observer.fault_delays)
     options = design.options
     yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
-    if options.get("weight") != "paper" or decide_rank(work.C).rank == work.ny:
+    if options.get("weight") != "paper" or decide_rank(np.hstack([work.C, work.Dd])).rank == work.ny:
         yield from weight_rows(gains, options.get("weight"))
     yield from _least_gain(design, work)
     return allowances
