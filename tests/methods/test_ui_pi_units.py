@@ -9,7 +9,9 @@ import pytest
 import scipy.linalg
 
 from obsynth import DescriptorSystem, ObserverDesign, PreconditionError, SpecError, ui_pi_observer
+from obsynth.analysis.existence.sharepasand import existence_conditions
 from obsynth.numerics.spectra import spectrum_error
+from obsynth.plants.faults import exosystem
 
 #: Two masses, a spring and a damper: positions and velocities.
 MASSES = np.array([[0, 1, 0, 0], [-2, -0.1, 2, 0.1], [0, 0, 0, 1], [2, 0.1, -2, -0.1]])
@@ -152,3 +154,30 @@ def test_given_exosystems_of_any_frequency() -> None:
     assert design.report.passed
     conditions = [check.name for check in design.report.checks if check.name.startswith("exists: (D3)")]
     assert conditions == ["exists: (D3) fault model at 0 +- 200000j"]
+
+
+def slow_chain(n: int, pole: float, link: float, measured: list[int], fault: int) -> DescriptorSystem:
+    """Return a sampled chain, each state driven by the next one, of which a fault drives one."""
+    a, c = pole * np.eye(n) + link * np.eye(n, k=1), np.eye(n)
+    return DescriptorSystem(A=a, C=c[measured], Bf=c[:, [fault]], dt=1.0)
+
+
+@pytest.mark.parametrize(
+    ("n", "pole", "link", "measured", "fault"),
+    [(10, 0.978, 0.019, [0, 8], 8), (14, 0.988, 0.015, [0, 6, 7], 9), (10, 0.977, 0.25, [0, 9], 8)],
+)
+def test_a_chain_that_is_sampled_fast_has_an_observer_as_fast_as_in_continuous_time_and_quiet(
+    n: int, pole: float, link: float, measured: list[int], fault: int
+) -> None:
+    # Beside the diagonal of A, nearly one, the link is weak; beside what a step changes of the state it is not.
+    plant = slow_chain(n, pole, link, measured, fault)
+    design = ui_pi_observer(plant)
+    continuous = ui_pi_observer(plant.replace(A=plant.A - np.eye(n), dt=0.0))
+    assert design.certificate.claims["decay"] > 0.5 * continuous.certificate.claims["decay"]
+    assert design.certificate.claims["noise_amplification"] < 0.02
+
+
+def test_a_fault_at_the_end_of_a_long_chain_is_not_denied_an_observer() -> None:
+    # Units of A made links of 0.03 as large as the diagonal, and the fault of no effect beside rounding.
+    plant = slow_chain(39, 0.9969, 0.1015, [0, 32], 6)
+    assert all(condition.holds for condition in existence_conditions(plant, exosystem("step", plant.fault_names, 1.0)))

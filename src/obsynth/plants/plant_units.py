@@ -2,6 +2,7 @@
 
 With ``x = S x'``, ``t = tau t'`` (no tau in discrete time): ``E' = Q E S``, ``A' = tau Q A S``, ``C' = Y C S``,
 ``Bf' = tau Q Bf Phi_f``, ``Phi' = tau W^-1 Phi W``; the factors are least squares in the logarithms of all entries.
+Of plants that are sampled so fast that A is nearly E they are those of ``A - E``, with the tau of one step.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ FAR_UNITS = 256.0
 
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
+
+#: A step that changes an entry by less than this share of it may be rounding of the entry.
+STEP_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
 #: Exponents of integer plants are often half of a whole number, which rounding would take up or down by chance.
 OFF_THE_TIES = 1e-3
@@ -46,25 +50,29 @@ class PlantUnits:
     @classmethod
     def of(cls, plant: DescriptorSystem, model: Exosystem | None = None) -> PlantUnits:
         """Return the units that suit a plant and the model of its faults."""
-        return _units_of(plant) if model is None else cls._found(plant, model)
+        own, by_steps = _units_of(plant)
+        return own if model is None else cls._balanced(plant, model, by_steps=by_steps)
 
     @classmethod
-    def _found(cls, plant: DescriptorSystem, model: Exosystem | None) -> PlantUnits:
+    def _balanced(cls, plant: DescriptorSystem, model: Exosystem | None, *, by_steps: bool = False) -> PlantUnits:
+        """Return the units of a plant, or of what a step changes: of ``A - E`` and its own time, in place of A."""
         nx, ny, order = plant.nx, plant.ny, 0 if model is None else model.order
         ends = np.cumsum([1, nx, nx, ny, plant.nf, plant.nd, order])
         equations, states, outputs, faults, disturbances, fault_model = (
             range(int(start), int(end)) for start, end in pairwise(ends)
         )
         problem = LogBalance(int(ends[-1]))
-        time = None if plant.is_discrete else 0
+        time = None if plant.is_discrete and not by_steps else 0
+        a = _change(plant.E, plant.A) if by_steps else plant.A
         # A state and the equation of its derivative belong together, however many others A links them to.
         problem.add(plant.E, equations, states, weight=float(nx))
-        problem.add(plant.A, equations, states, common=time)
+        problem.add(a, equations, states, common=time)
         problem.add(plant.Bf, equations, faults, common=time, weight=SIGNALS_WEIGHT)
         problem.add(plant.Bd, equations, disturbances, common=time, weight=SIGNALS_WEIGHT)
         problem.add(plant.C, outputs, states, weight=SIGNALS_WEIGHT)
         if model is not None:
-            problem.add(model.Phi, fault_model, fault_model, signs=(-1, 1), common=time)
+            phi = _change(np.eye(order), model.Phi) if by_steps else model.Phi
+            problem.add(phi, fault_model, fault_model, signs=(-1, 1), common=time)
         for row, size in zip(outputs, np.linalg.norm(plant.Dw, axis=1), strict=True):
             # Parts of a plant that do not touch each other compare by their noise.
             if size > 0.0:
@@ -72,7 +80,7 @@ class PlantUnits:
         exponents = problem.solve()
         _fix_sizes(plant, exponents, (equations, outputs), (states, faults, disturbances))
         factors = np.exp2(exponents)
-        own, equation_units = factors[states], factors[equations] * (1.0 if plant.is_discrete else factors[0])
+        own, equation_units = factors[states], factors[equations] * (1.0 if time is None else factors[0])
         output_units = _inverse_sizes(plant.C * own, plant.Df, plant.Dd)
         entering = [
             _inverse_sizes((equation_units[:, None] * inner).T, (output_units[:, None] * direct).T)
@@ -88,6 +96,11 @@ class PlantUnits:
         """Largest ratio of two factors of the same kind: how far the given units are from these."""
         kinds = (self.equations, self.states, self.outputs)
         return max(float(np.max(part) / np.min(part)) for part in kinds if part.size)
+
+    def apart(self, other: PlantUnits) -> float:
+        """Return the largest ratio of ratios of two factors of the same kind in these units and in others."""
+        kinds = ((self.equations, other.equations), (self.states, other.states), (self.outputs, other.outputs))
+        return float(np.exp2(max(np.ptp(np.log2(own) - np.log2(its)) for own, its in kinds if own.size)))
 
     @property
     def rate(self) -> float:
@@ -199,8 +212,21 @@ def _fix_sizes(
 
 
 @remembered
-def _units_of(plant: DescriptorSystem) -> PlantUnits:
-    return PlantUnits._found(plant, None)
+def _units_of(plant: DescriptorSystem) -> tuple[PlantUnits, bool]:
+    """Return the units of a plant, and whether they are those of what a step changes: where it is sampled so fast that
+    A is nearly E, beside which the weakest link of two states would count as a strong one."""
+    units = PlantUnits._balanced(plant, None)
+    if plant.is_discrete:
+        by_steps = PlantUnits._balanced(plant, None, by_steps=True)
+        if units.apart(by_steps) > FAR_UNITS:
+            return by_steps, True
+    return units, False
+
+
+def _change(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return ``after - before``, without what is only their rounding."""
+    change = after - before
+    return np.where(np.abs(change) > STEP_ROUNDING * np.abs(before), change, 0.0)
 
 
 def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
