@@ -295,7 +295,7 @@ def test_infinite_outputs_count_as_not_measured_and_rows_without_stamps_are_name
     plant, data = spec_of("linear").plant, clean("linear")
     data.loc[60, "yb"] = np.inf
     found = obsynth.calibrate(plant, data, {}, input_delay=0, starts=1)
-    assert "1 infinite value of yb counted as not measured." in found.verdict
+    assert "1 infinite cell of 'yb' counted as missing, first in row 61." in found.verdict
     data.loc[61, "time"] = np.nan
     with pytest.raises(obsynth.SpecError, match="Row 61, counted from 0, has no time stamp"):
         obsynth.calibrate(plant, data, {})

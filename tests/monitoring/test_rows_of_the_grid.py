@@ -140,7 +140,7 @@ def test_rows_that_a_saved_state_has_are_left_out_however_many_they_are(tmp_path
     assert found["status"][:60].isin(["out of order", "repeated stamp"]).all()
     pd.testing.assert_frame_equal(found[60:], wanted[60:])
     twice = pd.concat([data[:60], data[:30]], ignore_index=True)
-    with pytest.raises(SpecError, match=r"falls from [^;]* s\.$"):
+    with pytest.raises(SpecError, match=r"falls from [^;]* s, as it has since row 61\."):
         run("ui-pi-observer", "levels", twice)
 
 

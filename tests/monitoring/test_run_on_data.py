@@ -547,7 +547,8 @@ def test_an_alarm_of_the_initial_condition_response_is_told_with_a_warm_up_that_
         A=[[0.98]], B=[[0.02]], C=["level"], Bf=[[0.02]], dt=1.0, state_names=["level"], sensor_noise={"level": 1e-3}
     )
     design = obsynth.ui_pi_observer(plant)
-    rows = pd.DataFrame({"time": np.arange(400.0), "u1": 10.0, "level": 10.0})
+    # Other than what is stuck, a sensor moves.
+    rows = pd.DataFrame({"time": np.arange(400.0), "u1": 10.0, "level": 10.0 + 1e-6 * (np.arange(400) % 2)})
     levels = {"fhat[f1]": 0.01}
     (told,) = run_on_data(design, rows, thresholds=levels).warnings
     assert "level begins 1e+04 deviations of its noise from zero (no operating point is stated)" in told

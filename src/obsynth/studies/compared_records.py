@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.methods.fault_figures import on_the_clock
 from obsynth.monitoring.logs.log_tables import log_table
-from obsynth.monitoring.logs.signals import TIME_HEADER
+from obsynth.monitoring.logs.measured_columns import CONSTANT_ROWS, constant_text, never_measured
+from obsynth.monitoring.logs.signals import TIME_HEADER, missing_columns
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arguments import (
@@ -28,6 +29,9 @@ from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 
 #: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
 EXACT_ENTRIES = (0.0, 1.0, -1.0)
+
+#: A log of one row has no time in which an estimate could follow.
+LEAST_ROWS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +110,7 @@ class ComparedLog:
         scaled = {*(scales or {}), *plant.scales}
         units = {column: plant.units[name] for name, column in column_of.items() if name in {*plant.units} - scaled}
         time = (columns or {}).get(TIME_HEADER, TIME_HEADER)
-        table, _, remarks = log_table(data, list(column_of.values()), time, units=units)
+        table, header, remarks = log_table(data, list(column_of.values()), time, units=units)
         frame = {name: table[column] for name, column in column_of.items() if column in table}
         shift = None if plant.uncertainty is None else plant.uncertainty.shift
         if shift and frame:
@@ -114,15 +118,15 @@ class ComparedLog:
             frame[shift] = np.ones(max(map(len, frame.values())))
         missing = [column_of[name] for name in measured if name not in frame]
         if missing:
-            raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
+            raise missing_columns(header, missing, {column_of[name]: name for name in measured})
         count = max(map(len, frame.values()), default=0)
-        if not count:
-            raise SpecError("The log has no rows.", path="data")
+        if count < LEAST_ROWS:
+            raise SpecError(
+                f"The log has {counted(count, 'row')}: a comparison needs {LEAST_ROWS} and more.", path="data"
+            )
         for name in (*plant.input_names, *plant.output_names):
             if not np.isfinite(frame[name]).any():
-                raise SpecError(
-                    f"The column {column_of[name]!r} holds no number: {name!r} is never measured.", path="data"
-                )
+                raise SpecError(never_measured(column_of[name], name), path="data")
 
         def signals(names: Sequence[str]) -> FloatArray:
             offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
@@ -139,7 +143,19 @@ class ComparedLog:
         stamps = table.get(time)
         stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
         times = _clock(count, plant.dt) if stamps is None else stamps
-        return Record(times, u, y, truth, tuple(known_faults), (*remarks, *stuck_texts(stuck)))
+        notes = [*remarks, *stuck_texts(stuck), *_constant_texts({name: frame[name] for name in plant.output_names})]
+        if stamps is None:
+            notes.append(f"The log has no column {time!r}: its rows are taken as {plant.dt:g} s apart.")
+        return Record(times, u, y, truth, tuple(known_faults), tuple(notes))
+
+
+def _constant_texts(outputs: Mapping[str, FloatArray]) -> list[str]:
+    """Return what is to be said of outputs ``(rows,)`` that hold one number in all of many rows."""
+    return [
+        constant_text(name, float(np.nanmax(values)), len(values))
+        for name, values in outputs.items()
+        if len(values) >= CONSTANT_ROWS and np.nanmin(values) == np.nanmax(values)
+    ]
 
 
 def _outputs(

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError, counted
-from obsynth.monitoring.logs.clock import MOST_STALE
+from obsynth.monitoring.logs.clock import MOST_STALE, SORTED, unit_advice
 from obsynth.monitoring.logs.log_tables import log_table, parsed_rows
-from obsynth.monitoring.logs.signals import time_advice
+from obsynth.monitoring.logs.signals import mapping_advice, time_advice
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -35,6 +35,10 @@ NOTED_JITTER = 0.02
 
 #: The same of stamps and the grid itself, where two of them are off each other by more.
 LARGEST_STAMP_OFFSET = 0.25
+
+#: A log in which more rows than this are missing is not filled up: its grid would have little but missing rows, which a
+#: fit takes one by one, and a clock that jumps by years would fill the memory.
+MOST_MISSING_ROWS = 100_000
 
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
@@ -200,7 +204,8 @@ def read_log(
         wanted = held[name]
         if wanted not in table:
             raise SpecError(
-                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(names)}.", path=f"columns.{name}"
+                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(names)}. {mapping_advice(name)}",
+                path=f"columns.{name}",
             )
         numbers = _numbers(table[wanted], wanted, length)[first:last]
         return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
@@ -277,13 +282,14 @@ def _on_grid(
         notes.append(f"{counted(int(stale.sum()), 'row')} left out: the stamps do not rise.")
         time, u, y = time[~stale], u[~stale], y[~stale]
     step, counts, jitter = _grid(time, dt, rows[0])
+    _require_few_missing(time, counts, rows)
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     missing = ~np.isfinite(u)
     for name, column in zip(inputs, u.T, strict=True):
         finite = np.isfinite(column)
         if not finite.any():
-            raise bad_log("nan", f"The input {name!r} is nowhere finite in these rows.", path=f"log.{name}")
+            raise bad_log("nan", _never_finite("input", name), path=f"log.{name}")
         if not finite.all():
             notes.append(f"{counted(int((~finite).sum()), 'value')} of {name} missing: the last one before is held.")
             places = np.maximum.accumulate(np.where(finite, np.arange(len(column)), np.argmax(finite)))
@@ -291,7 +297,7 @@ def _on_grid(
             u[:, inputs.index(name)] = column[places]
     for name, column in zip(outputs, y.T, strict=True):
         if not np.isfinite(column).any():
-            raise bad_log("nan", f"The output {name!r} is nowhere finite in these rows.", path=f"log.{name}")
+            raise bad_log("nan", _never_finite("output", name), path=f"log.{name}")
         if np.isinf(column).any():
             notes.append(f"{counted(int(np.isinf(column).sum()), 'infinite value')} of {name} counted as not measured.")
     y = np.where(np.isfinite(y), y, np.nan)
@@ -310,6 +316,28 @@ def _on_grid(
     )
 
 
+def _never_finite(kind: str, name: str) -> str:
+    return f"The {kind} {name!r} is nowhere finite in these rows: give other rows. {mapping_advice(name)}"
+
+
+def _require_few_missing(time: FloatArray, counts: NDArray[np.int64], rows: tuple[int, int]) -> None:
+    """Refuse stamps ``(n,)`` with so many steps between them ``(n - 1,)`` that most of the grid would be missing."""
+    missing = int((counts - 1).sum())
+    if missing <= MOST_MISSING_ROWS:
+        return
+    gap = int(np.argmax(counts))
+    after = rows[0] + gap + 1
+    parts = [(rows[0], after), (after, rows[1])]
+    first, last = max(parts, key=lambda part: part[1] - part[0])
+    raise bad_log(
+        "time",
+        f"{missing:,} rows are missing, most of them before row {after}, counted from 0, which comes "
+        f"{time[gap + 1] - time[gap]:.6g} s after the one before: more than {MOST_MISSING_ROWS:,} are not filled up. "
+        f"Give a part of the log (rows {first}:{last}).",
+        path="log.time",
+    )
+
+
 def _grid(time: FloatArray, dt: float | None, first: int) -> tuple[float, NDArray[np.int64], FloatArray]:
     """Return the step of the grid of stamps ``(n,)`` which begin in row ``first``, the steps between them, and how far
     each is off, in steps; refuse stamps that are on none."""
@@ -318,7 +346,9 @@ def _grid(time: FloatArray, dt: float | None, first: int) -> tuple[float, NDArra
         raise bad_log("time", f"Row {first + bad}, counted from 0, has no time stamp.", path="log.time")
     if (np.diff(time) <= 0).any():
         bad = int(np.argmax(np.diff(time, prepend=-np.inf) <= 0))
-        raise bad_log("time", f"Stamps must rise, but that of row {first + bad} is {time[bad]:g} s.", path="log.time")
+        raise bad_log(
+            "time", f"Stamps must rise, but that of row {first + bad} is {time[bad]:g} s. {SORTED}.", path="log.time"
+        )
     gaps = np.diff(time)
     step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
     counts = np.round(gaps / step).astype(np.int64)
@@ -337,14 +367,14 @@ def _grid(time: FloatArray, dt: float | None, first: int) -> tuple[float, NDArra
         raise bad_log(
             "irregular",
             f"The stamps are irregular: row {first + worst + 1} is {jitter[worst]:.0%} "
-            f"of a step off the grid of {step:g} s. Resample the log.",
+            f"of a step off the grid of {step:g} s. Resample the log.{unit_advice(float(np.median(gaps)) / step)}",
             path="log.time",
         )
     if counts.size > 1 and counts.min() > 1:
         raise bad_log(
             "irregular",
             f"No two rows are less than {counts.min() * step:.10g} s apart, but a step takes {step:.10g} s: the "
-            "sampling time does not fit.",
+            f"sampling time does not fit.{unit_advice(float(counts.min()))}",
             path="log.time",
         )
     return step, counts, jitter

@@ -45,6 +45,23 @@ GAP_FACTOR = 10.0
 MOST_COUNTED_SAMPLES = 2.0**53
 
 
+#: Units in which stamps may be that are taken as seconds, and how many seconds one of theirs is then taken for.
+TIME_UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600, "d": 1 / 86400}
+
+#: An interval is taken for one in another unit where it is off that by this share at most, as stamps jitter.
+UNIT_SHARE = 0.05
+
+#: What mends a log whose time falls for good.
+SORTED = "Sort the log by its time; if logs were joined, give each by itself"
+
+
+def unit_advice(samples: float) -> str:
+    """Return what helps where rows are so many samples apart as they are with stamps in another unit than seconds, as a
+    sentence with a blank before it; empty where no unit fits."""
+    fits = [unit for unit, size in TIME_UNITS.items() if abs(samples / size - 1.0) <= UNIT_SHARE]
+    return f" If the stamps are in {fits[0]}, call their column 'time [{fits[0]}]'." if fits else ""
+
+
 class StampError(SpecError):
     """A stamp that comes before the one of an earlier row."""
 
@@ -59,7 +76,7 @@ class StampError(SpecError):
             "Clocks go back like this in autumn, and the stamps name no time zone: state it (time_zone, --time-zone "
             "Europe/Berlin), or sort the log by its time"
             if is_autumn
-            else "Sort the log by its time"
+            else SORTED
         )
         return f"Row {self.row}: the time falls from {date_of(self.last)} to {date_of(self.time)}. {mend}."
 
@@ -104,9 +121,17 @@ class Clock:
             self.last = self.stamp = time
             return 0.0, 0
         if time == last:
-            raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
+            since = f", as all rows from row {row - self.left_out} on" if 0 < self.left_out < row else ""
+            raise SpecError(
+                f"Row {row} repeats the time {time:.17g} s of the row before{since}. Name the column of the time "
+                "(--time-column).",
+                path=f"row {row}",
+            )
         if time < last:
-            raise StampError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", row, last, time)
+            since = f", as it has since row {row - self.left_out}" if 0 < self.left_out < row else ""
+            raise StampError(
+                f"Row {row}: the time falls from {last:.17g} to {time:.17g} s{since}. {SORTED}.", row, last, time
+            )
         step = interval(last, time)
         self.is_own = self.irregular and self._is_irregular(step)
         if self.is_own:
@@ -186,14 +211,15 @@ class Clock:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
                 "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
-                "need a continuous-time design, or a recursive one of a continuous plant that was sampled.",
+                "need a continuous-time design, or a recursive one of a continuous plant that was sampled."
+                f"{unit_advice(step / self.dt)}",
                 path=f"row {row}",
             )
         # One gap may be the first interval of a log.
         if count > 1 and self.longest == 0.0 and self.count > 0:
             raise SpecError(
                 f"Row {row}: the log is sampled every {step:.6g} s, but the design needs {self.dt:.6g} s: resample the "
-                f"log, or design with sample_time: {step:.6g}.",
+                f"log, or design with sample_time: {step:.6g}.{unit_advice(step / self.dt)}",
                 path=f"row {row}",
             )
         self.away = average

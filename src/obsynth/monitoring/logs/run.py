@@ -17,8 +17,11 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.monitoring.alarms.events import AlarmEvent, rows_in_alarm
+from obsynth.monitoring.logs.clock import STALE
 from obsynth.monitoring.logs.followed import FollowedLog
+from obsynth.monitoring.logs.log_observer import GAP
 from obsynth.monitoring.logs.log_run import LogRun, resume_state, save_state
+from obsynth.monitoring.logs.measured_columns import never_measured
 from obsynth.monitoring.logs.signals import TIME_HEADER
 from obsynth.monitoring.logs.sinks import FrameSink, Sink, sink_for
 from obsynth.monitoring.logs.smoothing import LaterRows
@@ -303,6 +306,7 @@ def run_on_data(
         _run_rows(run, rows, sink, measured, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
             _require_a_window(design, run.rows)
+            _require_estimates(run, stamps)
     if state is not None:
         save_state(Path(state), run, digest)
     return replace(
@@ -336,7 +340,14 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
         isolated=run.isolated,
         recovered={} if run.recovered is None else dict(run.recovered.flags),
         outliers=dict(getattr(run.observer, "outliers", {})),
-        warnings=(*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *start, *stuck_texts(stuck)),
+        warnings=(
+            *run.observer.notes,
+            *stamps.warnings(),
+            *run.first.warnings(),
+            *stamps.measured.notes(run.signals.signals_of_columns(), run.signals.inputs),
+            *start,
+            *stuck_texts(stuck),
+        ),
         digest=digest,
         stamps=stamps,
         alarm_rows=dict(run.alarm_rows),
@@ -372,6 +383,14 @@ def _require_a_window(design: ObserverDesign, rows: int) -> None:
             "verdict. Design the test with fewer samples.",
             path="samples",
         )
+
+
+def _require_estimates(run: LogRun, stamps: Stamps) -> None:
+    """Raise `SpecError` where no row of a log has an estimate, as a column of it is empty."""
+    signals = run.signals.signals_of_columns()
+    empty = stamps.measured.empty(list(signals))
+    if empty and not run.statuses.keys() - {GAP, *STALE}:
+        raise SpecError(never_measured(empty[0], signals[empty[0]]), path=f"columns.{signals[empty[0]]}")
 
 
 def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:

@@ -158,11 +158,7 @@ class LogSignals:
             matches[i] = matches[i] if base is None else matches[self.columns.index(base[0])]
         missing = sorted({name for name, present in zip(self.columns, matches, strict=True) if present is None})
         if missing:
-            raise SpecError(
-                f"The data have no column {', '.join(map(repr, missing))}; they have "
-                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing, *self._first_of(missing))}",
-                path="data",
-            )
+            raise missing_columns(header, missing, self.signals_of_columns())
         present = [name for name in matches if name is not None]
         repeated = sorted({name for name in present if header.count(name) > 1})
         if repeated:
@@ -172,12 +168,11 @@ class LogSignals:
             )
         return [header.index(name) for name in present]
 
-    def _first_of(self, missing: Sequence[str]) -> tuple[str, str]:
-        """Return the first of these columns that is for a signal, and the signal; of the time where none is."""
-        signals = dict(
+    def signals_of_columns(self) -> dict[str, str]:
+        """Return the signal of each column that is read, but the time."""
+        return dict(
             zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.constant_signal), strict=True)
         )
-        return next(((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER))
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
@@ -185,6 +180,18 @@ class LogSignals:
         values = [self.point.get(name, 0.0) for name in observer.state_names]
         values += [0.0 if name in biases else self.point.get(name, 0.0) for name in observer.fault_names]
         return np.array(values + [0.0] * (len(observer.columns) - len(values)))
+
+
+def missing_columns(header: Sequence[str], missing: Sequence[str], signals: Mapping[str, str]) -> SpecError:
+    """Return the error for a log without some columns, which are of these ``signals``, or the time."""
+    column, signal = next(
+        ((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER)
+    )
+    return SpecError(
+        f"The data have no column {', '.join(map(repr, missing))}; they have "
+        f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing, column, signal)}",
+        path="data",
+    )
 
 
 def _column(name: str, names: Sequence[str], renamed: Mapping[str, str]) -> str:
@@ -257,7 +264,7 @@ def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | No
     return by_column
 
 
-def _advice(header: tuple[str, ...], missing: list[str], column: str, signal: str) -> str:
+def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: str) -> str:
     """Return what to do about columns that are missing, such as this one of a signal, or of the time."""
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
@@ -265,7 +272,12 @@ def _advice(header: tuple[str, ...], missing: list[str], column: str, signal: st
         return advice
     meant = next((name for name in header if name.casefold() == column.casefold()), "YOUR_COLUMN")
     question = suggestion(column, header)
-    return f"{question} Map it: --map {shlex.quote(signal)}={shlex.quote(meant)}.".lstrip()
+    return f"{question} {mapping_advice(signal, meant)}".lstrip()
+
+
+def mapping_advice(signal: str, column: str = "YOUR_COLUMN") -> str:
+    """Return how a signal is mapped to a column, as a sentence."""
+    return f"Map it: --map {shlex.quote(signal)}={shlex.quote(column)}."
 
 
 def time_advice(header: Sequence[str]) -> str:

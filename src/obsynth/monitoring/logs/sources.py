@@ -65,7 +65,8 @@ def chunks(
 ) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it.  The first rows are left out up to the time ``after``."""
-    blocks = _differenced(_without_days(_chunks(data, signals, stamps, rows), stamps), stamps, goes_on=after is None)
+    blocks = _finite(_without_days(_chunks(data, signals, stamps, rows), stamps), signals, stamps)
+    blocks = _differenced(blocks, stamps, goes_on=after is None)
     if after is not None:
         blocks = _later(blocks, after)
     if not signals.delay or not signals.inputs:
@@ -83,6 +84,13 @@ def _without_days(blocks: Iterator[FloatArray], stamps: Stamps) -> Iterator[Floa
     for count, chunk in enumerate(blocks):
         if not count:
             stamps.require_no_days(chunk[:, 0])
+        yield chunk
+
+
+def _finite(blocks: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
+    """Yield rows in which infinite cells of signals are missing, and note what the columns hold."""
+    for chunk in blocks:
+        stamps.measured.take(chunk, signals.columns[1:], stamps.formed)
         yield chunk
 
 
@@ -187,6 +195,8 @@ def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
 def check_suffix(path: Path, suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> None:
     """Raise `SpecError` unless a file is of a known kind by its name, and its package is installed."""
     suffix = log_suffix(path)
+    if suffix not in suffixes and path.is_dir():
+        raise SpecError(f"{path} is a folder: name one file.", path=str(path))
     if suffix not in suffixes:
         raise SpecError(f"{path} has an unknown suffix: use one of {', '.join(suffixes)}.", path=str(path))
     if suffix in NEEDED_PACKAGES:

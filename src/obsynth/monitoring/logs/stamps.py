@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from obsynth.errors import SpecError, counted
+from obsynth.monitoring.logs.measured_columns import MeasuredColumns
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.measurement_units import MICRO_SIGNS
@@ -194,6 +195,8 @@ class Stamps:
         #: The decimal mark that numbers of a column have shown, and rows of cells that may group thousands instead.
         self.decimals: dict[str, str] = {}
         self.groups: dict[tuple[str, str], tuple[int, str]] = {}
+        #: Which columns have held a finite number, and which infinite ones.
+        self.measured = MeasuredColumns()
         #: Columns that have shown a number: of the others words are no bad samples, but another kind of column.
         self.numeric: set[str] = set()
         #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
@@ -212,6 +215,7 @@ class Stamps:
                 f"row {row}."
                 for column, (count, row, text) in self.words.items()
             ),
+            *self.measured.warnings(),
             *(
                 f"{counted(count, 'cell')} of {column!r} counted as missing, as {status!r} says so, first {text!r} in "
                 f"row {row}."

@@ -153,8 +153,10 @@ def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator
             continue
         row += 1
         if any(cell.strip() for cell in cells[len(header) :]):
+            advice = " If numbers have a decimal comma, separate the columns by semicolons." if not comma else ""
             raise SpecError(
-                f"Row {row} has {len(cells)} cells, but the header has {len(header)}.", path=f"cells of row {row}"
+                f"Row {row} has {len(cells)} cells, but the header has {len(header)}.{advice}",
+                path=f"cells of row {row}",
             )
         cells = [*cells[: len(header)], *[""] * (len(header) - len(cells))]
         stamp = cells[places[0]] if date is None else with_date(cells[date], cells[places[0]])

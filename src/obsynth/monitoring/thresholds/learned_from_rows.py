@@ -79,6 +79,7 @@ def thresholds_from_rows(
     validated: bool = True,
     drifts: SensorDrifts | None = None,
     sensor_drift: float = 0.0,
+    missing: str = "",
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
@@ -87,7 +88,7 @@ def thresholds_from_rows(
     ``initial_covariance``: that of the states at a start anywhere; ``repeats``: from which equal sample on outputs
     count as not measured; ``validated``: whether the levels are those that
     rows keep which are not learned from; ``drifts``: what drifts of the sensors do that are allowed for, of so many
-    deviations, ``sensor_drift``.
+    deviations, ``sensor_drift``; ``missing``: what a log with too few rows lacks, as a sentence.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
@@ -99,7 +100,7 @@ def thresholds_from_rows(
     usual = [i for i in range(len(names)) if i not in seldom]
     complete = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
     every_other = pairs.others(every)
-    count = _checked_count(complete)
+    count = _checked_count(complete, missing)
     conformal = is_conformal(count, every_other)
     scores = None if scores is None else _usual_scores(scores, complete)
     choices = _column_choices(rows[complete], names, usual, faults, like, with_scores=scores is not None)
@@ -155,13 +156,13 @@ def thresholds_from_rows(
     )
 
 
-def _checked_count(complete: NDArray[np.bool_]) -> int:
-    """Return how many rows are complete; raise `SpecError` where they are too few."""
+def _checked_count(complete: NDArray[np.bool_], missing: str) -> int:
+    """Return how many rows are complete; raise `SpecError`, with what is ``missing``, where they are too few."""
     count = int(complete.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
             f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
-            f"give {LEAST_NORMAL} and more.",
+            f"give {LEAST_NORMAL} and more.{missing}",
             path="normal",
         )
     return count

@@ -15,6 +15,7 @@ from obsynth.monitoring.logs.clock import STALE
 from obsynth.monitoring.logs.log_observer import DECIDING, Row
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.log_tables import parsed_rows
+from obsynth.monitoring.logs.measured_columns import mostly_missing
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, Logs, chunks
 from obsynth.monitoring.logs.stamps import Stamps
@@ -203,6 +204,7 @@ def learn_thresholds(
         innovation=output.innovation_size(),
         outlier_sizes=sizes,
         initial_covariance=starts,
+        missing=logs.missing(signals),
         **options,
     )
     raised = raised_levels(design, learned, output.watched, output.scores, **options)
@@ -215,7 +217,12 @@ def learn_thresholds(
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
     return replace(
         learned,
-        notes=(*notes, *notes_of_sizes(white, inputs), *notes_of_starts(divided)),
+        notes=(
+            *_notes_of_cells([stamps for _, stamps in read], signals),
+            *notes,
+            *notes_of_sizes(white, inputs),
+            *notes_of_starts(divided),
+        ),
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
         drift_limits=_drift_limits(design, lambda: new_run(sizes, starts), logs, offsets, learned)
         if drifts is None and len(logs.ends) == 1
@@ -255,6 +262,10 @@ class _NormalLogs:
     def ends(self) -> list[tuple[int, int]]:
         """First row of each log, and the one after its last."""
         return _ends_of(self.borders)
+
+    def missing(self, signals: LogSignals) -> str:
+        """Return which signals many rows are without, as a sentence; empty where there are none."""
+        return mostly_missing(self.rows, {name: i for i, name in enumerate(signals.signals_of_columns().values(), 1)})
 
     def slices_of(self, numbers: NDArray[np.int64]) -> tuple[slice, ...]:
         """Return for each log which of some ascending row numbers are its own."""
@@ -501,6 +512,15 @@ def _read(data: Data, signals: LogSignals, time_zone: str | None, time_unit: str
     """Return the rows of a log ``(n, 1 + nu + ny)``, and how to write its times."""
     stamps = Stamps(time_zone, time_unit)
     return np.vstack([np.zeros((0, 1 + len(signals.names))), *chunks(data, signals, stamps, CHUNK_ROWS)]), stamps
+
+
+def _notes_of_cells(logs: Sequence[Stamps], signals: LogSignals) -> list[str]:
+    """Return what is to be said of the cells of logs."""
+    return [
+        f"Log {number}: {text}" if len(logs) > 1 else text
+        for number, stamps in enumerate(logs, 1)
+        for text in (*stamps.warnings(), *stamps.measured.notes(signals.signals_of_columns(), signals.inputs))
+    ]
 
 
 def started_anywhere(observer: Any, reached: FloatArray) -> FloatArray | None:
