@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -156,58 +156,7 @@ class LearnedThresholds:
     @property
     def statement(self) -> str:
         """What the thresholds mean, and whether the rows suffice for it."""
-        model, lasting = self.statistics.model, self.every * self.dt
-        text = (
-            f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
-            f"({_duration(lasting)}) on average, in {_counted(len(self.columns), 'column')}"
-            + (
-                f", and in changes of {_counted(len(self.statistics.estimates), 'fault')}"
-                if self.statistics.estimates
-                else ""
-            )
-            + f"; alarms less than {HOLD} rows apart count as one"
-            + (
-                "; the level was found from the second half of these rows"
-                if is_conformal(self.rows, self.pairs.others(self.every))
-                else ""
-            )
-        )
-        time = self.healthy_time
-        text += (
-            f"; healthy rows that were not learned from are in alarm for {100 * time.expected:.2g} % of the time (95 % "
-            f"interval {100 * time.low:.2g} to {100 * time.high:.2g} %, "
-            + (f"between {self.logs} logs)" if self.logs > 1 else "between parts of one log)")
-        )
-        if self.sensor_drift:
-            unknown = ", ".join(self.without_drift)
-            text += (
-                f"; a slow drift of each sensor{f' but {unknown}' if unknown else ''} by "
-                f"{_counted_number(self.sensor_drift, 'deviation')} of its noise is allowed for"
-                + (
-                    f" (for {unknown} no noise is stated and the log shows none, or nothing is known with such a drift)"
-                    if unknown
-                    else ""
-                )
-            )
-        if self.drift_limits:
-            limits = " or of ".join(f"{name} by {limit:.2g}" for name, limit in self.drift_limits.items())
-            text += (
-                f"; one log does not rule out that sensors drift otherwise in others, and a slow drift of {limits} "
-                "deviations of its noise alarms as long as it lasts: give three normal logs, or allow for it "
-                "(sensor_drift)"
-            )
-        if self.lasting:
-            text += (
-                f"; the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
-                f"{self.lasting:.2g}), so that large ones come together: the levels are those of a rate "
-                f"{RARER_WHERE_SIZES_LAST:g} times as low, and single logs may alarm more often than stated"
-            )
-        if self.pairs.number:
-            text += (
-                f"; {_counted(self.pairs.number, 'pair')} of wrong samples in a row, which count as not measured: one "
-                f"alarms when it comes, which is once per {1.0 / self.pairs.chance:.3g} rows by chance, and is among "
-                "the false alarms"
-            )
+        text = "; ".join((*self._rate_in_words(), *self._drifts_in_words(), *self._dependence_in_words()))
         if self.holds:
             return text
         if self.rows >= self.needed:
@@ -215,18 +164,72 @@ class LearnedThresholds:
                 f"{text}. That is more than {100 * MOST_HEALTHY_TIME:g} %: parts of these rows are unlike the others. "
                 "Give several normal logs, of other starts and set points"
             )
-        rarest = min(self.rows, self.every)
-        remedy = (
-            f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
-            f"({_duration(rarest * self.dt)})"
-        )
-        if rows_needed(model, 1.0) > self.rows:
-            remedy = "the residuals are too strongly correlated, or too many, for any rate from these rows"
-        elif self.needed > rows_needed(model, self.every):
-            remedy = "the estimates are too strongly correlated for any rate from these rows"
         return (
             f"{text}. Too few rows for this rate ({self.rows}; about {self.needed:,} needed, "
-            f"{_duration(self.needed * self.dt)}): {remedy}"
+            f"{_duration(self.needed * self.dt)}): {self._possible_rate_in_words()}"
+        )
+
+    def _rate_in_words(self) -> Iterator[str]:
+        """Yield what is promised of false alarms, and what rows that were not learned from show of it."""
+        estimates = self.statistics.estimates
+        changes = f", and in changes of {_counted(len(estimates), 'fault')}" if estimates else ""
+        yield (
+            f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
+            f"({_duration(self.every * self.dt)}) on average, in {_counted(len(self.columns), 'column')}{changes}"
+        )
+        yield f"alarms less than {HOLD} rows apart count as one"
+        if is_conformal(self.rows, self.pairs.others(self.every)):
+            yield "the level was found from the second half of these rows"
+        time = self.healthy_time
+        compared = f"between {self.logs} logs" if self.logs > 1 else "between parts of one log"
+        yield (
+            f"healthy rows that were not learned from are in alarm for {100 * time.expected:.2g} % of the time (95 % "
+            f"interval {100 * time.low:.2g} to {100 * time.high:.2g} %, {compared})"
+        )
+
+    def _drifts_in_words(self) -> Iterator[str]:
+        """Yield which slow drifts of sensors are allowed for, and which would alarm."""
+        if self.sensor_drift:
+            unknown = ", ".join(self.without_drift)
+            why = f" (for {unknown} no noise is stated and the log shows none, or nothing is known with such a drift)"
+            yield (
+                f"a slow drift of each sensor{f' but {unknown}' if unknown else ''} by "
+                f"{_counted_number(self.sensor_drift, 'deviation')} of its noise is allowed for{why if unknown else ''}"
+            )
+        if self.drift_limits:
+            limits = " or of ".join(f"{name} by {limit:.2g}" for name, limit in self.drift_limits.items())
+            yield (
+                f"one log does not rule out that sensors drift otherwise in others, and a slow drift of {limits} "
+                "deviations of its noise alarms as long as it lasts: give three normal logs, or allow for it "
+                "(sensor_drift)"
+            )
+
+    def _dependence_in_words(self) -> Iterator[str]:
+        """Yield what it means that large residuals come together, and that wrong samples come in pairs."""
+        if self.lasting:
+            yield (
+                f"the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
+                f"{self.lasting:.2g}), so that large ones come together: the levels are those of a rate "
+                f"{RARER_WHERE_SIZES_LAST:g} times as low, and single logs may alarm more often than stated"
+            )
+        if self.pairs.number:
+            yield (
+                f"{_counted(self.pairs.number, 'pair')} of wrong samples in a row, which count as not measured: one "
+                f"alarms when it comes, which is once per {1.0 / self.pairs.chance:.3g} rows by chance, and is among "
+                "the false alarms"
+            )
+
+    def _possible_rate_in_words(self) -> str:
+        """Return the lowest rate that these rows can determine, or why there is none."""
+        model = self.statistics.model
+        if rows_needed(model, 1.0) > self.rows:
+            return "the residuals are too strongly correlated, or too many, for any rate from these rows"
+        if self.needed > rows_needed(model, self.every):
+            return "the estimates are too strongly correlated for any rate from these rows"
+        rarest = min(self.rows, self.every)
+        return (
+            f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
+            f"({_duration(rarest * self.dt)})"
         )
 
     def as_dict(self) -> dict[str, Any]:
