@@ -29,6 +29,7 @@ from obsynth.exporting.c_source import (
 from obsynth.exporting.dae_float import float_error, in_floats, in_precision
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.nonlinear.c_code import observer_code, observer_struct
 from obsynth.observers.running import as_run, rule_of_outliers
@@ -215,17 +216,28 @@ def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) ->
         raise SpecError(
             "Thresholds are written as C for constants that stay the same (variation: constant).", path="monitor"
         )
+    same = np.array_equal(bound.start, after.start) and np.array_equal(bound.start_later[1], after.start_later[1])
+    sizes = _threshold_sizes(bound, after, same=same)
+    tables = _threshold_tables(bound, after, same=same)
+    enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
+    lines = [
+        "",
+        f"enum {{ {enumerated} }};",
+        f"static const double THETA = {max(bound.start_later[0], after.start_later[0])!r};",
+        f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
+        "",
+        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),
+    ]
+    return in_precision("\n".join(lines) + "\n" + filled_template("adaptive_threshold.c", prefix, {}), "double")
+
+
+def _threshold_sizes(bound: AdaptiveBound, after: AdaptiveBound, *, same: bool) -> dict[str, int]:
+    """Return the sizes of the tables, and where those of a later start begin: ``same`` ones are there once."""
     p, nz, rows, m, no = bound.counts
     structure = bound.structure
     n, out = structure.reading.shape
     nv = bound.drive.shape[2]
-    ny = bound.rounding.shape[1] - 1 - nv
-    (theta, later), (theta_after, later_after) = bound.start_later, after.start_later
-    starts, lasting = bound.start, later[None]
-    same = np.array_equal(bound.start, after.start) and np.array_equal(later, later_after)
-    if not same:
-        starts, lasting = np.vstack([starts, after.start]), np.vstack([lasting, later_after])
-    sizes = {
+    return {
         "P": p,
         "NZ": nz,
         "ROWS": rows,
@@ -233,7 +245,7 @@ def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) ->
         "NO": no,
         "N": n,
         "NU": nv - n,
-        "NY": ny,
+        "NY": bound.rounding.shape[1] - 1 - nv,
         "NV": nv,
         "OUT": out,
         "W": bound.width,
@@ -247,10 +259,18 @@ def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) ->
         "AGAIN_AT": 0 if same else len(bound.start),
         "LATER_AT": 0 if same else 1,
     }
-    tables = {
+
+
+def _threshold_tables(bound: AdaptiveBound, after: AdaptiveBound, *, same: bool) -> dict[str, FloatArray]:
+    """Return the tables by name, the starts of both bounds one below the other unless they are the ``same``."""
+    structure = bound.structure
+    starts, later = bound.start, bound.start_later[1][None]
+    if not same:
+        starts, later = np.vstack([starts, after.start]), np.vstack([later, after.start_later[1]])
+    return {
         "Az": structure.Az,
         "reading": structure.reading,
-        "drive": bound.drive.reshape(-1, nv),
+        "drive": bound.drive.reshape(-1, bound.drive.shape[2]),
         "shown": bound.output_rows,
         "offsets": structure.offsets[None],
         "channels": structure.channel_rows,
@@ -261,16 +281,6 @@ def threshold_source(bound: AdaptiveBound, after: AdaptiveBound, prefix: str) ->
         "nominal": bound.nominal[None],
         "rounding": bound.rounding,
         "start": starts,
-        "later": lasting,
+        "later": later,
         "driven": np.array([bound.remainder_inputs], dtype=np.float64),
     }
-    enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    lines = [
-        "",
-        f"enum {{ {enumerated} }};",
-        f"static const double THETA = {max(theta, theta_after)!r};",
-        f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
-        "",
-        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),
-    ]
-    return in_precision("\n".join(lines) + "\n" + filled_template("adaptive_threshold.c", prefix, {}), "double")

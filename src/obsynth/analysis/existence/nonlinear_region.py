@@ -36,68 +36,73 @@ def region_conditions(
 
 
 def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequence[str]) -> Iterator[Condition]:
+    """Yield the conditions, each for a plant that meets those before it."""
+    form = "E is constant, its derivatives are independent, and no formula jumps"
     try:
         terms = nonlinear_terms(model, faults=faults)
     except PreconditionError as error:
-        yield Condition(
-            error.condition or "form", "E is constant, its derivatives are independent, and no formula jumps", False,
-            0.0, 1.0, _SOURCE, str(error), signals=error.signals,
-            of_the_method=True,
-        )  # fmt: skip
+        yield _of_the_form(error.condition or "form", form, str(error), signals=error.signals)
         return
     count = len(terms.nonlinearities)
-    yield Condition(
-        "constant E", "E is constant, its derivatives are independent, and no formula jumps", True, 1.0, 1.0, _SOURCE,
+    yield _of_the_form(
+        "constant E",
+        form,
         f"{counted(terms.differential, 'differential state or fault', 'differential states and faults')}, "
         f"{len(terms.names) - terms.differential} algebraic, {counted(count, 'nonlinearity', 'nonlinearities')}",
-        of_the_method=True,
-    )  # fmt: skip
+        value=1.0,
+    )
     if region is None:
-        yield Condition(
-            "region stated", "the region is stated", False, 0.0, 1.0, _SOURCE,
-            "there is none: give ranges of the signals (option region)",
-            of_the_method=True,
-        )  # fmt: skip
+        text = "there is none: give ranges of the signals (option region)"
+        yield _of_the_form("region stated", "the region is stated", text)
         return
+    bounded = "every nonlinearity has a bounded slope over the region"
     try:
         place = OperatingRegion.of(terms, region)
         slopes = place.slopes()
     except PreconditionError as error:
-        yield Condition(
-            "bounded slopes", "every nonlinearity has a bounded slope over the region", False, 0.0, 1.0, _SOURCE,
-            str(error), signals=error.signals,
-            of_the_method=True,
-        )  # fmt: skip
+        yield _of_the_form("bounded slopes", bounded, str(error), signals=error.signals)
         return
-    yield Condition(
-        "bounded slopes", "every nonlinearity has a bounded slope over the region", True, float(len(slopes)),
-        float(len(slopes)), _SOURCE, f"{counted(len(slopes), 'slope')}",
-        of_the_method=True,
-    )  # fmt: skip
+    number = float(len(slopes))
+    yield _of_the_form("bounded slopes", bounded, counted(len(slopes), "slope"), value=number, needed=number)
+    is_small = len(slopes) <= MOST_SLOPES
     yield Condition(
         "corners", "the slopes are no more than can be proved: at their corners, or in one block",
-        len(slopes) <= MOST_SLOPES, float(len(slopes)), float(MOST_SLOPES), _SOURCE,
-        "" if len(slopes) <= MOST_SLOPES else
+        is_small, number, float(MOST_SLOPES), _SOURCE,
+        "" if is_small else
         f"{len(slopes)} slopes: write products of one argument as one function of it, or linearise what hardly bends",
     )  # fmt: skip
-    if len(slopes) <= MOST_SLOPES:
-        bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
-        # Of more slopes the block that is proved holds the algebraic equations, too.
-        if terms.differential < len(terms.names) and len(slopes) <= MOST_CORNER_SLOPES:
-            yield _algebraic_states(terms, slopes, bounds)
-        middle = bounds.mean(axis=1)
-        yield _detectable(terms, slopes, middle, "in the middle", "with slopes in the middle of their bounds")
-        for k in np.flatnonzero((bounds[:, 0] < 0.0) & (bounds[:, 1] > 0.0) & (middle != 0.0)):
-            at_zero = np.where(np.arange(len(middle)) == k, 0.0, middle)
-            condition = _detectable(terms, slopes, at_zero, "where a slope is zero", "where the slope of one is zero")
-            if not condition.holds:
-                text = terms.nonlinearities[slopes[k].nonlinearity].expression.text
-                which = place.in_signals(
-                    f"This is where the slope of {text!r} by {ARGUMENT}{slopes[k].argument} is zero."
-                )
-                # Slopes of several nonlinearities need not take these values together.
-                yield replace(condition, of_the_method=True, detail=f"{condition.detail}. {which}")
-                return
+    if is_small:
+        yield from _at_values_of_the_slopes(terms, place, slopes)
+
+
+def _of_the_form(
+    name: str, claim: str, detail: str, *, value: float = 0.0, needed: float = 1.0, signals: Sequence[str] = ()
+) -> Condition:
+    """Return a condition on the form of plant and region, which the method needs; it holds at the ``needed`` value."""
+    return Condition(
+        name, claim, value == needed, value, needed, _SOURCE, detail, signals=tuple(signals), of_the_method=True
+    )
+
+
+def _at_values_of_the_slopes(
+    terms: NonlinearTerms, place: OperatingRegion, slopes: Sequence[Slope]
+) -> Iterator[Condition]:
+    """Yield what must hold at single values of the slopes: at corners, in the middle, and where one is zero."""
+    bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
+    # Of more slopes the block that is proved holds the algebraic equations, too.
+    if terms.differential < len(terms.names) and len(slopes) <= MOST_CORNER_SLOPES:
+        yield _algebraic_states(terms, slopes, bounds)
+    middle = bounds.mean(axis=1)
+    yield _detectable(terms, slopes, middle, "in the middle", "with slopes in the middle of their bounds")
+    for k in np.flatnonzero((bounds[:, 0] < 0.0) & (bounds[:, 1] > 0.0) & (middle != 0.0)):
+        at_zero = np.where(np.arange(len(middle)) == k, 0.0, middle)
+        condition = _detectable(terms, slopes, at_zero, "where a slope is zero", "where the slope of one is zero")
+        if not condition.holds:
+            text = terms.nonlinearities[slopes[k].nonlinearity].expression.text
+            which = place.in_signals(f"This is where the slope of {text!r} by {ARGUMENT}{slopes[k].argument} is zero.")
+            # Slopes of several nonlinearities need not take these values together.
+            yield replace(condition, of_the_method=True, detail=f"{condition.detail}. {which}")
+            return
 
 
 def _at_slopes(terms: NonlinearTerms, slopes: Sequence[Slope], values: FloatArray) -> tuple[FloatArray, FloatArray]:

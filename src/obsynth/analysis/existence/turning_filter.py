@@ -75,36 +75,14 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     T = states * prepared.T * prepared.scaling.equations
     N = states * prepared.N * prepared.scaling.outputs
     driven = [T @ vertex.Bf for vertex in plant.vertices]
-    late = sum(not decide_rank(C @ each, expected=plant.nf).full for each in driven)
-    yield Condition(
-        "one sample to the outputs",
-        "every fault reaches the outputs after one sample: C T Bf has full column rank at both vertices",
-        not late,
-        float(late),
-        0.0,
-        _SOURCE,
-        "" if not late else "a filter for later ones over a region is not known here. ui-pi-observer does not need it",
-        of_the_method=True,
-    )
-    if late:
+    after_one_sample = _after_one_sample(C, driven)
+    yield after_one_sample
+    if not after_one_sample.holds:
         return
     rows, target = _equations(C, driven)
     freedom = decide_rank(rows)
     solvable = decide_rank(np.vstack([rows, target])).rank == freedom.rank
-    yield Condition(
-        TURNING_CONDITION,
-        "K(mu) C T Bf(mu) = T Bf(mu) has a solution that is affine in the weights",
-        solvable,
-        float(solvable),
-        1.0,
-        _SOURCE,
-        ""
-        if solvable
-        else "there are too few outputs to follow how the faults turn: measure more, or take ui-pi-observer, for which "
-        "faults may turn",
-        signals=() if solvable else plant.fault_names,
-        of_the_method=True,
-    )
+    yield _correction_condition(plant, solvable)
     if not solvable:
         return
     # Directions of the size one, so that the larger vertex does not outweigh the other.
@@ -122,6 +100,39 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     halves = [slice(i * m, (i + 1) * m) for i in range(plant.count)]
     made.append(
         TurningFilter(T, N, W, tuple(K0[:, half] for half in halves), tuple(U[half] for half in halves), Delta, reach)
+    )
+
+
+def _after_one_sample(C: FloatArray, driven: list[FloatArray]) -> Condition:
+    """Return whether every fault reaches the outputs after one sample, for ``T Bf`` at each vertex."""
+    late = sum(not decide_rank(C @ each, expected=each.shape[1]).full for each in driven)
+    return Condition(
+        "one sample to the outputs",
+        "every fault reaches the outputs after one sample: C T Bf has full column rank at both vertices",
+        not late,
+        float(late),
+        0.0,
+        _SOURCE,
+        "" if not late else "a filter for later ones over a region is not known here. ui-pi-observer does not need it",
+        of_the_method=True,
+    )
+
+
+def _correction_condition(plant: PolytopicSystem, solvable: bool) -> Condition:
+    """Return whether there is a correction that is affine in the weights and turns with the faults."""
+    return Condition(
+        TURNING_CONDITION,
+        "K(mu) C T Bf(mu) = T Bf(mu) has a solution that is affine in the weights",
+        solvable,
+        float(solvable),
+        1.0,
+        _SOURCE,
+        ""
+        if solvable
+        else "there are too few outputs to follow how the faults turn: measure more, or take ui-pi-observer, for which "
+        "faults may turn",
+        signals=() if solvable else plant.fault_names,
+        of_the_method=True,
     )
 
 

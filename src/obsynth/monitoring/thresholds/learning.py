@@ -176,10 +176,7 @@ def learn_thresholds(
     signals = new_run().signals
     read = [_read(log, signals, time_zone, time_unit) for log in several(data)]
     if not units_as_is:
-        for log_rows, _ in read:
-            units = UnitCheck(design, signals)
-            units.take(signals.deviations(log_rows))
-            units.finish()
+        _require_units(design, signals, [log_rows for log_rows, _ in read])
     logs = _NormalLogs.of([log_rows for log_rows, _ in read], signals)
     output, sizes = _output_and_outlier_sizes(design, new_run, logs.rows, logs.ends)
     starts = started_anywhere(design.observer, output.starts)
@@ -228,6 +225,14 @@ def learn_thresholds(
         if drifts is None and len(logs.ends) == 1
         else {},
     )
+
+
+def _require_units(design: ObserverDesign, signals: LogSignals, logs: Sequence[FloatArray]) -> None:
+    """Raise `SpecError` where a signal of a log is likely in another unit than that of the plant."""
+    for rows in logs:
+        units = UnitCheck(design, signals)
+        units.take(signals.deviations(rows))
+        units.finish()
 
 
 @dataclass(frozen=True, eq=False)
