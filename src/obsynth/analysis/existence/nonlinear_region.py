@@ -94,7 +94,7 @@ def _at_values_of_the_slopes(
         yield _algebraic_states(terms, slopes, bounds)
     middle = bounds.mean(axis=1)
     yield _detectable(terms, slopes, middle, "in the middle", "with slopes in the middle of their bounds")
-    for k in np.flatnonzero((bounds[:, 0] < 0.0) & (bounds[:, 1] > 0.0) & (middle != 0.0)):
+    for k in map(int, np.flatnonzero((bounds[:, 0] < 0.0) & (bounds[:, 1] > 0.0) & (middle != 0.0))):
         at_zero = np.where(np.arange(len(middle)) == k, 0.0, middle)
         condition = _detectable(terms, slopes, at_zero, "where a slope is zero", "where the slope of one is zero")
         if not condition.holds:
