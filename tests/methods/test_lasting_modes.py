@@ -194,3 +194,17 @@ def test_weights_reach_the_noise_beside_modes_that_last() -> None:
     weights = {"inputs": {plant.noise_names[0]: 2.0}}
     for norm in ("hinf", "h2"):
         assert obsynth.optimal_filter(plant, norm=norm, weights=weights, delay=1).report.passed
+
+
+def test_noise_of_the_plant_may_have_the_name_of_what_is_added() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[1]],
+        C=[[1], [1]],
+        Bf=[[0]],
+        Df=[[1], [0]],
+        Bw=np.zeros((1, 2)),
+        Dw=np.eye(2),
+        dt=1.0,
+        noise_names=("drive of lasting mode 1", "noise y1"),
+    )
+    assert obsynth.optimal_filter(plant, delay=0).report.passed

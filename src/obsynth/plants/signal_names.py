@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -69,6 +70,18 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
     return listed
+
+
+def unused_names(names: Sequence[str], used: Iterable[str]) -> tuple[str, ...]:
+    """Return names of signals that are added to a plant: with a number behind each that is used already."""
+    taken, free = set(used), list[str]()
+    for name in names:
+        new = next(
+            one for one in itertools.chain([name], (f"{name} ({i})" for i in itertools.count(2))) if one not in taken
+        )
+        taken.add(new)
+        free.append(new)
+    return tuple(free)
 
 
 def plain_names(names: Any) -> Any:

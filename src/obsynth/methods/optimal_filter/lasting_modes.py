@@ -18,6 +18,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.signal_names import unused_names
 
 #: Noise that drives them, of the largest of the plant's own, in units in which the plant is near one: the less, the
 #: nearer is the gain to the least, and the slower the errors settle (at 1e-2 in some hundred samples).
@@ -53,7 +54,10 @@ def _with_drives(plant: DescriptorSystem, drive: float, name: str, *, grows: boo
     return plant.replace(
         Bw=np.hstack([plant.Bw, size * columns / left]),
         Dw=np.hstack([plant.Dw, np.zeros((plant.ny, count))]),
-        noise_names=[*plant.noise_names, *(f"{name} {i + 1}" for i in range(count))],
+        noise_names=[
+            *plant.noise_names,
+            *unused_names([f"{name} {i + 1}" for i in range(count)], plant.noise_names),
+        ],
     )
 
 

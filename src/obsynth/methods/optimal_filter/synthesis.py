@@ -45,6 +45,7 @@ from obsynth.numerics.standard_form import cayley, uncayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import stability_factor
@@ -465,7 +466,7 @@ def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[
         noisy = plant.replace(
             Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(quiet)))]),
             Dw=np.hstack([plant.Dw, columns]),
-            noise_names=[*plant.noise_names, *(f"noise {name}" for name in noise)],
+            noise_names=[*plant.noise_names, *unused_names([f"noise {name}" for name in noise], plant.noise_names)],
         )
         try:
             least = designed(noisy, chosen.fault_map, "hinf", ADDED_NOISES[:1])
