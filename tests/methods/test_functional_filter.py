@@ -464,3 +464,18 @@ def test_a_filter_without_a_proof_of_stability_is_written_in_triangular_states(
     np.testing.assert_allclose(
         other.certificate.matrices["deviations"], plain.certificate.matrices["deviations"], rtol=1e-8
     )
+
+
+@pytest.mark.parametrize(
+    ("n", "pole", "link", "measured", "fault"),
+    [(8, 0.9987, 0.1144, [0, 5, 7], 5), (9, 0.9959, 0.0823, [0, 1], 8), (25, 0.993, 0.0874, [0, 4, 18, 19], 5)],
+)
+def test_a_chain_that_is_sampled_fast_has_a_filter(
+    n: int, pole: float, link: float, measured: list[int], fault: int
+) -> None:
+    # Beside the diagonal of A, nearly one, the links are weak: in units of A the last fault was said to show nowhere.
+    a, c = pole * np.eye(n) + link * np.eye(n, k=1), np.eye(n)
+    plant = obsynth.DescriptorSystem(A=a, C=c[measured], Bf=c[:, [fault]], dt=1.0)
+    design = obsynth.functional_filter(plant)
+    assert design.report.passed
+    assert design.certificate.claims["decay"] > 0.1 * (1.0 - pole)

@@ -63,7 +63,7 @@ class PlantUnits:
         )
         problem = LogBalance(int(ends[-1]))
         time = None if plant.is_discrete and not by_steps else 0
-        a = _change(plant.E, plant.A) if by_steps else plant.A
+        a = step_change(plant.E, plant.A) if by_steps else plant.A
         # A state and the equation of its derivative belong together, however many others A links them to.
         problem.add(plant.E, equations, states, weight=float(nx))
         problem.add(a, equations, states, common=time)
@@ -71,7 +71,7 @@ class PlantUnits:
         problem.add(plant.Bd, equations, disturbances, common=time, weight=SIGNALS_WEIGHT)
         problem.add(plant.C, outputs, states, weight=SIGNALS_WEIGHT)
         if model is not None:
-            phi = _change(np.eye(order), model.Phi) if by_steps else model.Phi
+            phi = step_change(np.eye(order), model.Phi) if by_steps else model.Phi
             problem.add(phi, fault_model, fault_model, signs=(-1, 1), common=time)
         for row, size in zip(outputs, np.linalg.norm(plant.Dw, axis=1), strict=True):
             # Parts of a plant that do not touch each other compare by their noise.
@@ -223,7 +223,7 @@ def _units_of(plant: DescriptorSystem) -> tuple[PlantUnits, bool]:
     return units, False
 
 
-def _change(before: FloatArray, after: FloatArray) -> FloatArray:
+def step_change(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return ``after - before``, without what is only their rounding."""
     change = after - before
     return np.where(np.abs(change) > STEP_ROUNDING * np.abs(before), change, 0.0)

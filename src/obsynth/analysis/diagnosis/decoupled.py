@@ -196,7 +196,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     """Remove the unknown inputs and the faults ``removed`` from a plant; keep the columns ``kept``."""
     nx, ny = plant.nx, plant.ny
     pencil_e, pencil_a = unknowns_pencil(plant, removed)
-    units = PencilUnits.of(pencil_e, pencil_a)
+    units = PencilUnits.of(pencil_e, pencil_a, sampled=plant.is_discrete)
     part = left_part(
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )

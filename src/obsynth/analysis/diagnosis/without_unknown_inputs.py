@@ -17,6 +17,7 @@ from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.staircase import full_svd
+from obsynth.plants.plant_units import FAR_UNITS, step_change
 
 #: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
 BY_LEAST_SQUARES = 40
@@ -31,8 +32,21 @@ class PencilUnits:
     time: float
 
     @classmethod
-    def of(cls, E: FloatArray, A: FloatArray) -> PencilUnits:
-        """Return the units of ``A - sE (m, n)``; those of the data play no role, that of time included."""
+    def of(cls, E: FloatArray, A: FloatArray, *, sampled: bool = False) -> PencilUnits:
+        """Return the units of ``A - sE (m, n)``; those of the data play no role, that of time included.
+
+        Where a ``sampled`` plant is so slow that A is nearly E, they are those of what a step changes."""
+        units = cls._balanced(E, A)
+        if sampled and A.size:
+            change = step_change(E, A)
+            by_steps = cls._balanced(E, change)
+            if float(np.ptp(np.log2(by_steps.columns) - np.log2(units.columns))) > np.log2(FAR_UNITS):
+                moving = E.any(axis=1)
+                return cls(np.where(moving, by_steps.rows * by_steps.time, by_steps.rows), by_steps.columns, 1.0)
+        return units
+
+    @classmethod
+    def _balanced(cls, E: FloatArray, A: FloatArray) -> PencilUnits:
         m, n = A.shape
         balance = LogBalance(m + n + 1)
         rows, columns = range(m), range(m, m + n)
