@@ -143,9 +143,9 @@ class Realisation:
         tables |= {"noise_variances": missing.noise[None]}
         if solver is not None:
             tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": solver}
-        kept = missing.kept_inputs
+        kept_inputs = missing.kept_inputs
         return GapTables(
-            plant.nf, estimated, kept, moving.nx, missing.known_states, True, solver is not None, tables,
+            plant.nf, estimated, kept_inputs, moving.nx, missing.known_states, True, solver is not None, tables,
             GAP_LEFT_SHARE, LEAST_SHOWN,
         )  # fmt: skip
 

@@ -29,7 +29,7 @@ SavedState = TypeVar("SavedState", bound=tuple[Any, ...])
 Robust = TypeVar("Robust", bound=Any)
 
 #: Takes the states before and after a sample, what is known at it, and its inputs.
-Kept: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
+AfterStep: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
 
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
@@ -157,18 +157,19 @@ class StepObserver(Observer[Any, Any]):
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.within_bounds(row)
 
-    def accept(self, state: Any, y: FloatArray, u: FloatArray, kept: Kept | None = None) -> tuple[Any, Any]:
-        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``); ``kept``
-        is called with what each sample, whose values are all of its own time, led from and to: see `Kept`."""
-        after, row = self.timing.advance(partial(self._in_order, kept), state, y, u)
+    def accept(self, state: Any, y: FloatArray, u: FloatArray, after_step: AfterStep | None = None) -> tuple[Any, Any]:
+        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``).
+
+        ``after_step`` is called for each sample whose values are all of its own time: see `AfterStep`."""
+        after, row = self.timing.advance(partial(self._in_order, after_step), state, y, u)
         return after, self.within_bounds(row)
 
-    def _in_order(self, kept: Kept | None, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
+    def _in_order(self, after_step: AfterStep | None, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
-        if kept is not None:
-            kept(state, after, row, u)
+        if after_step is not None:
+            after_step(state, after, row, u)
         return after, row
 
     def step(self, state: Any, y: ArrayLike, u: ArrayLike = ()) -> tuple[Any, Estimates]:

@@ -51,9 +51,11 @@ class WindowRows:
 
     def add(self, entries: Mapping[int, float], right: float, *, relaxed: bool = False) -> None:
         """Append a row for variables in their own units; t relaxes it by its largest entry."""
-        kept = {column: float(value * self.scales[column]) for column, value in entries.items() if value != 0.0}
-        unit = _power_of_two(max((abs(value) for value in kept.values()), default=1.0))
-        columns, values = list(kept), [value / unit for value in kept.values()]
+        scaled_entries = {
+            column: float(value * self.scales[column]) for column, value in entries.items() if value != 0.0
+        }
+        unit = _power_of_two(max((abs(value) for value in scaled_entries.values()), default=1.0))
+        columns, values = list(scaled_entries), [value / unit for value in scaled_entries.values()]
         if relaxed:
             columns.append(len(self.scales) - 1)
             values.append(-1.0)

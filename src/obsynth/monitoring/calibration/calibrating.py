@@ -430,10 +430,10 @@ class _Fitting:
         for _ in range(OUTLIER_ROUNDS):
             whitened, innovations, variances = Likelihood(problem).innovations(fit.v)
             judged = replace(fit, whitened=whitened, innovations=innovations, variances=variances)
-            kept = _without_outlying_rows(problem, judged)
-            if kept is None:
+            usual_rows = _without_outlying_rows(problem, judged)
+            if usual_rows is None:
                 break
-            problem = problem.with_log(kept)
+            problem = problem.with_log(usual_rows)
         self.note(f"all {log.samples} rows")
         fits = simulation_fits(problem, 1, self.seed, self.note, start=fit.t)
         again, _ = innovations_fit(problem, fits, self.level, self.note, known=fit)
@@ -476,12 +476,12 @@ class _Fitting:
             if fitted.fit is None:
                 break
             problem = fitted.problem
-            kept = _without_outlying_rows(problem, fitted.fit)
-            if kept is None:
+            usual_rows = _without_outlying_rows(problem, fitted.fit)
+            if usual_rows is None:
                 break
             self.note("without samples that stand out")
-            fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=fitted.fit.t)
-            again = _innovations(problem.with_log(kept), fits, self.level, self.note, fitted.error)
+            fits = simulation_fits(problem.with_log(usual_rows), 1, self.seed, self.note, start=fitted.fit.t)
+            again = _innovations(problem.with_log(usual_rows), fits, self.level, self.note, fitted.error)
             fitted = _FittedProblem(again[0], fits, *again[1:], fitted.losses)
         return fitted
 

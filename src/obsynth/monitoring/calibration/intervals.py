@@ -77,9 +77,9 @@ def information(
     matrix = hessian[:nt, :nt]
     if nuisance:
         values, vectors = np.linalg.eigh(hessian[np.ix_(nuisance, nuisance)])
-        kept = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
-        across = hessian[:nt, nuisance] @ vectors[:, kept]
-        matrix = matrix - (across / values[kept]) @ across.T
+        determined = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
+        across = hessian[:nt, nuisance] @ vectors[:, determined]
+        matrix = matrix - (across / values[determined]) @ across.T
     return covariance_of(matrix, widths, names)
 
 

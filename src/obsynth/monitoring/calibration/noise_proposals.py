@@ -175,21 +175,25 @@ def _letters(problem: CalibrationProblem) -> list[tuple[str, str]]:
 
 
 class _SearchStart:
-    """What a fit found, by name, from which a search with one more state begins."""
+    """Results of a fit, by name, from which a search with one more state begins."""
 
     def __init__(
-        self, t: dict[str, float], variances: dict[tuple[str, str], float], kept: dict[str, float], R: FloatArray
+        self,
+        t: dict[str, float],
+        variances: dict[tuple[str, str], float],
+        autocorrelations: dict[str, float],
+        R: FloatArray,
     ) -> None:
-        self.t, self.variances, self.kept, self.R = t, variances, kept, R
+        self.t, self.variances, self.autocorrelations, self.R = t, variances, autocorrelations, R
 
     @classmethod
     def of(cls, problem: CalibrationProblem, fit: InnovationsFit) -> _SearchStart:
-        """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
+        """Return the results of a fit, and the first autocorrelation of the innovations of each sensor."""
         columns = zip(problem.output_names, fit.whitened.T, strict=True)
-        kept = {name: whiteness(column).first for name, column in columns}
+        autocorrelations = {name: whiteness(column).first for name, column in columns}
         variances = dict(zip(_letters(problem), (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
         spread = np.nanmean(fit.innovations**2, axis=0)
-        return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
+        return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, autocorrelations, spread)
 
     def best(self, problem: CalibrationProblem) -> tuple[float, _SearchStart]:
         """Return the least negative log likelihood with another model, and what it found."""
@@ -201,7 +205,11 @@ class _SearchStart:
             for j, name in enumerate(problem.output_names):
                 if correlation_name(name) in self.t or noise_state(name) not in problem.noisy:
                     continue
-                time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_AUTOCORRELATIONS)))
+                time = (
+                    -longer
+                    * problem.log.dt
+                    / float(np.log(np.clip(self.autocorrelations[name], *FIRST_AUTOCORRELATIONS)))
+                )
                 if correlation_name(name) in problem.unknown:
                     t[correlation_name(name)] = float(np.log(time))
                 variances["Q", noise_state(name)] = process_variance(
@@ -227,5 +235,8 @@ class _SearchStart:
         Q, R = objective.noise(z)
         variances_at = dict(zip(_letters(problem), (*Q.tolist(), *R.tolist()), strict=True))
         return value, _SearchStart(
-            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), variances_at, self.kept, self.R
+            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)),
+            variances_at,
+            self.autocorrelations,
+            self.R,
         )

@@ -143,10 +143,10 @@ class PlantWithNoise(CalibrationPlant):
     def _inner_constants(self, x: Any, t: Any, unknown: Sequence[str]) -> tuple[tuple[str, ...], Any]:
         """Return what the plant itself takes as unknown, and its values: constants, and loads from their states."""
         searched = {correlation_name(name) for name in self.states.searched}
-        kept = [i for i, name in enumerate(unknown) if name not in searched]
+        constants = [i for i, name in enumerate(unknown) if name not in searched]
         loads = x[x.numel() - len(self.states.loads) :] if self.states.loads else ca.SX(0, 1)
-        values = ca.vertcat(*(t[i] for i in kept), loads)
-        return (*(unknown[i] for i in kept), *self.states.loads), values if values.numel() else ca.SX(0, 1)
+        values = ca.vertcat(*(t[i] for i in constants), loads)
+        return (*(unknown[i] for i in constants), *self.states.loads), values if values.numel() else ca.SX(0, 1)
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
@@ -177,8 +177,8 @@ class PlantWithNoise(CalibrationPlant):
                 rows.append(rate + fall)
         else:
             for i in range(parts.shape[0]):
-                kept = ca.exp(-dt / self._correlation(self.coloured[i], t, unknown)) if i < len(self.coloured) else 1.0
-                rows.append(parts[i, :] - kept * before[i])
+                decay = ca.exp(-dt / self._correlation(self.coloured[i], t, unknown)) if i < len(self.coloured) else 1.0
+                rows.append(parts[i, :] - decay * before[i])
         return ca.vertcat(*rows)
 
     def outputs(self, unknown: Sequence[str]) -> Any:

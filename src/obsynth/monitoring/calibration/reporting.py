@@ -178,16 +178,18 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
     nt, scale = error.nt, error.scale
     inner = start.information
     marginal = inner[:nt, :nt] - inner[:nt, nt:] @ np.linalg.solve(inner[nt:, nt:], inner[nt:, :nt])
-    kept = slice(None, len(problem.names))
-    marginal = np.linalg.inv(np.linalg.inv(marginal)[kept, kept]) if problem.plant.bounds else marginal
-    information = covariance_of(marginal, problem.widths[kept], problem.names)
+    constants = slice(None, len(problem.names))
+    marginal = np.linalg.inv(np.linalg.inv(marginal)[constants, constants]) if problem.plant.bounds else marginal
+    information = covariance_of(marginal, problem.widths[constants], problem.names)
     y = error.simulated(np.concatenate([start.t, start.x0]) / scale)[0]
     e = problem.y - y
     root = quantile(level, len(problem.names), problem.log.samples, len(problem.output_names))
     spread = root * np.sqrt(np.diag(information.covariance))
     sides = [
         (Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high))
-        for t, half, low, high in zip(start.t[kept], spread, problem.low[kept], problem.high[kept], strict=True)
+        for t, half, low, high in zip(
+            start.t[constants], spread, problem.low[constants], problem.high[constants], strict=True
+        )
     ]
     ends = (start.t - problem.low < END_SHARE * problem.widths) | (problem.high - start.t < END_SHARE * problem.widths)
     variances = np.tile(start.deviations**2, (len(y), 1))

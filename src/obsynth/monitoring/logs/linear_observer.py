@@ -38,7 +38,7 @@ SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing row
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
     *("moves", "reach"),
-    *("clear_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
+    *("clear_at", "begun", "changes", "counted", "gap_error", "held", "excess", "carried", "known_from", "bridged"),
 )
 
 _Part = TypeVar("_Part")
@@ -91,7 +91,7 @@ class LinearLogObserver(LogObserver):
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
         # What a unit error of each input that was held, and of each output that the model told, has left in z.
-        self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
+        self.gap_error, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
         # How inputs have moved, and how far those that are missing may have moved since they were known.
         self.moves, self.reach = no_inputs(self.nu), np.zeros(self.nu)
         # What the errors of the last gap have left in z, and what those of the gaps before it had in the columns.
@@ -147,7 +147,7 @@ class LinearLogObserver(LogObserver):
                 self.moves = taken_inputs(self.moves, self.v[: self.nu], u, is_first=first).history
                 estimates = self._measured(seconds, values)
                 if self.model is not None:
-                    self.model, self.left, self.reach = None, np.zeros_like(self.left), np.zeros(self.nu)
+                    self.model, self.gap_error, self.reach = None, np.zeros_like(self.gap_error), np.zeros(self.nu)
                     # The initial-condition response settles in as many measured rows as without a gap: what the gap
                     # adds is no larger than what is left of the start then, and goes with it.
                     self.settled_at += since * missing / (missing + 1)
@@ -296,10 +296,10 @@ class LinearLogObserver(LogObserver):
         # An input that was held was off by no more than it has changed since, or may have by how it moved before.
         missed = np.concatenate([np.maximum(np.abs(v[:nu] - self.held), self.reach), missed])
         usual, step = self._usual(), self.observer.dt or longest
-        if not (np.isfinite(self.left).all() and step > 0.0):
+        if not (np.isfinite(self.gap_error).all() and step > 0.0):
             self.carried = np.full_like(self.carried, np.inf)
             return self.warm_up, self.warm_up
-        a, remaining = self.observer.Az, self.left
+        a, remaining = self.observer.Az, self.gap_error
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
             from_model = remaining.any(axis=0) & np.repeat([False, True], [nu, len(self.output_names)])
@@ -312,10 +312,10 @@ class LinearLogObserver(LogObserver):
         # The first row after a gap always counts as recovering.
         while waited < max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0):
             remaining, waited = a @ remaining, waited + step
-            kept = np.abs(rows @ remaining) @ missed
-            if np.all(kept <= usual):
+            effects = np.abs(rows @ remaining) @ missed
+            if np.all(effects <= usual):
                 recovered = min(recovered, waited)
-            if np.all(kept <= GUARANTEED_SHARE * usual):
+            if np.all(effects <= GUARANTEED_SHARE * usual):
                 break
         return recovered, waited
 
@@ -323,7 +323,7 @@ class LinearLogObserver(LogObserver):
         """Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size
         before and after it."""
         gap_model = _running(self.gap_model)
-        if not self.left[:, self.nu :].any():
+        if not self.gap_error[:, self.nu :].any():
             return False
         # The outputs and the model may both be huge; a miss that is not finite is lost as well.
         return not gap_model.miss(v, self.model, self.fault) <= gap_model.miss(self.measured) + gap_model.miss(v)
@@ -378,9 +378,9 @@ class LinearLogObserver(LogObserver):
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
             transition, constant, _ = self._hold(seconds)
-            self.left = transition @ self.left + constant * from_model
+            self.gap_error = transition @ self.gap_error + constant * from_model
         else:
-            self.left = self.observer.Az @ self.left + self.b * from_model
+            self.gap_error = self.observer.Az @ self.gap_error + self.b * from_model
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v + self.observer.added)
         self._taken(v)
         row[self.observer.fault_rows] = self.fault[self.estimated_faults]
@@ -405,7 +405,11 @@ class LinearLogObserver(LogObserver):
 
     def _restart(self) -> None:
         self.z = self.model = None
-        self.v, self.left, self.reach = np.zeros_like(self.v), np.zeros_like(self.left), np.zeros_like(self.reach)
+        self.v, self.gap_error, self.reach = (
+            np.zeros_like(self.v),
+            np.zeros_like(self.gap_error),
+            np.zeros_like(self.reach),
+        )
         self.inputs = self.inputs[:0]
         self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
         self.settled_at, self.phase = math.inf, WARM_UP

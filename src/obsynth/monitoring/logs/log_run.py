@@ -312,8 +312,8 @@ class LogRun:
             row = self.observer.take(own, values, seconds=seconds, missing=missing, longest=longest)
             return row._replace(missed=missed) if missed else row
         except ObsynthError as error:
-            for part, kept in zip(parts, before, strict=True):
-                vars(part).update(kept)
+            for part, fields_before in zip(parts, before, strict=True):
+                vars(part).update(fields_before)
             place = f"row {number}"
             if self.stamps is not None and self.stamps.is_dated and isinstance(error, StampError):
                 error.args = (error.dated(self.stamps.shown, is_autumn=self.stamps.may_be_autumn),)

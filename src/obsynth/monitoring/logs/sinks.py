@@ -96,7 +96,9 @@ class FrameSink:
         if not self._count:
             return pd.DataFrame([], columns=self._header)
         columns = zip(self._header, self._others, self._numbers, strict=True)
-        series = [pd.Series(objects or kept[: self._count], name=name, copy=False) for name, objects, kept in columns]
+        series = [
+            pd.Series(objects or numbers[: self._count], name=name, copy=False) for name, objects, numbers in columns
+        ]
         frame = pd.DataFrame(dict(enumerate(series)), copy=False)
         frame.columns = pd.Index(self._header)
         return frame

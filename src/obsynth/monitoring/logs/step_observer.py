@@ -97,8 +97,8 @@ class SteppingLogObserver(LogObserver):
         evidence: Evidence
         try:
             with np.errstate(all="ignore"):
-                kept = None if self.chain is None else self.chain.add
-                self.state, evidence = self._stepping().accept(self.state, y, u, kept)
+                record_step = None if self.chain is None else self.chain.add
+                self.state, evidence = self._stepping().accept(self.state, y, u, record_step)
         except (np.linalg.LinAlgError, ValueError):
             return None
         if evidence.is_finite:

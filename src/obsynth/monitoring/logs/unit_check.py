@@ -157,5 +157,5 @@ def _mean_square(observer: Any, rows: Sequence[FloatArray] | FloatArray, nu: int
         degrees = int(np.isfinite(row[nu:]).sum())
         if degrees and state.k > 1:
             squares.append(float(estimate.nis) / degrees)
-    kept = sorted(squares)[:-1]
-    return float(np.mean(kept)) if kept and np.isfinite(kept).all() else np.inf
+    without_largest = sorted(squares)[:-1]
+    return float(np.mean(without_largest)) if without_largest and np.isfinite(without_largest).all() else np.inf

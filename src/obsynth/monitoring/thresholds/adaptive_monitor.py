@@ -211,9 +211,9 @@ def initial_box(plant: DescriptorSystem, initial_set: Mapping[str, Any]) -> tupl
 def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     """Return what an alarm proves, what it rests on, and what bounds may do in the long run."""
     uncertain, box = assumed.plant.uncertainty, assumed.box
-    kept = assumed.bounds_phrase if box is None else assumed.phrase()
+    assumptions = assumed.bounds_phrase if box is None else assumed.phrase()
     outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
-    text = f"never passed without a fault{f', with {kept}' if kept else ''}{outside}"
+    text = f"never passed without a fault{f', with {assumptions}' if assumptions else ''}{outside}"
     held = ""
     if assumed.plant.is_discrete and assumed.plant.nd:
         held = BOUNDS_AND_HELD_INPUTS.format(dt=shown(assumed.plant.dt)) if assumed.moves else HELD
@@ -221,9 +221,9 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
         return text + held + NO_TOLERANCE
     steps = () if uncertain is None else uncertain.steps
     sampled = any(kind == SAMPLED for kind, _ in steps)
-    kept = ""
+    motion = ""
     if box.variation != "constant":
-        kept = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
+        motion = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
     radius = loop_radius(plan.bound.responses)
     ever = "" if radius < 1.0 else (f"; it holds at each sample, but may grow (loop radius {radius:.3g})")
     if plan.sample_time is not None:
@@ -232,7 +232,7 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     why = (plan.reason[:1].lower() + plan.reason[1:]).partition(": ")[0].rstrip(".")
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {why}"
     linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
-    return f"{text}{kept}{held}{ever}{missing}{linear}"
+    return f"{text}{motion}{held}{ever}{missing}{linear}"
 
 
 def tolerances_of(
@@ -254,8 +254,8 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
         return design
     plant, _ = design.linear
     noise = noisy_plant(plant, scenario, resolve(plant, scenario))
-    kept = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
-    return design.replace(plant=noise.replace(Bw=noise.Bw[:, kept], Dw=noise.Dw[:, kept], noise_names=None))
+    acting = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
+    return design.replace(plant=noise.replace(Bw=noise.Bw[:, acting], Dw=noise.Dw[:, acting], noise_names=None))
 
 
 def over_box(

@@ -54,7 +54,7 @@ class IntersampleErrorSystem:
     second: FloatArray  # the same at the next sample
     direct: FloatArray
     rows: slice
-    left: float  # what modes that do not decay add per unit of each state, at most
+    lasting_gain: float  # what modes that do not decay add per unit of each state, at most
 
     @classmethod
     def of(
@@ -89,12 +89,12 @@ class IntersampleErrorSystem:
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
         into = exact(g1) @ c - exact(t)
 
-        def split(kept: FloatArray, *, decays: bool) -> IntersampleErrorSystem:
-            parts = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=decays)
+        def split(projector: FloatArray, *, decays: bool) -> IntersampleErrorSystem:
+            parts = _split(phi, k, j, into, projector, az, observer.Cz[rows], endless=decays)
             return cls(smooth, dt, *parts[:4], g1, earlier.midpoint, observer.Dy[rows], rows, parts[4])
 
         try:
-            return split(_kept(smooth, dt, k, terms), decays=True)
+            return split(_onto_decaying_modes(smooth, dt, k, terms), decays=True)
         except SpecError:
             if endless:
                 raise
@@ -196,9 +196,9 @@ class IntersampleErrorSystem:
 
     def lasting_words(self, limit: float) -> str:
         """Return what to say of modes that do not decay: up to which state rounding on them does not matter."""
-        if not self.left > 0.0 or not np.isfinite(limit):
+        if not self.lasting_gain > 0.0 or not np.isfinite(limit):
             return ""
-        return f"; while no state of the plant exceeds {ADDED * limit / self.left:.2g} in its unit"
+        return f"; while no state of the plant exceeds {ADDED * limit / self.lasting_gain:.2g} in its unit"
 
     def at_any_stamps(self, sizes: FloatArray, observer: LinearObserver) -> float:
         """Return what straight lines between outputs add at any stamps at most ``dt`` apart; may be infinite."""
@@ -243,7 +243,7 @@ class InputResponse:
         return float(np.max(np.linalg.norm(states @ self.c.T, axis=1), initial=0.0))
 
 
-def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
+def _onto_decaying_modes(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
     """Return the projector ``(n, n)`` onto the modes of a plant that decay; raise where others are not straight."""
     n = plant.nx
     if not np.any(np.abs(k.midpoint) + k.radius > TERM_ROUNDING * terms):
@@ -280,13 +280,14 @@ def _dying(a: FloatArray, dt: float) -> FloatArray | None:
 
 
 def _split(
-    phi: Ball, k: Ball, j: Ball, into: Ball, kept: FloatArray, az: FloatArray, cz: FloatArray, *, endless: bool
+    phi: Ball, k: Ball, j: Ball, into: Ball, onto_followed: FloatArray, az: FloatArray, cz: FloatArray, *, endless: bool
 ) -> tuple[Ball, FloatArray, Contraction | None, Ball, float]:
-    """Return ``M, c, contraction, into`` and the gain of the modes left out, for the projector ``kept (n, n)`` onto
-    the modes that are followed."""
-    n, exact = len(kept), Ball.exact
-    followed = kept.any()
-    projector, lasting = exact(kept), exact(np.eye(n)) - exact(kept)
+    """Return ``M, c, contraction, into`` and the gain of the modes left out.
+
+    ``onto_followed (n, n)`` is the projector onto the modes that are followed."""
+    n, exact = len(onto_followed), Ball.exact
+    followed = onto_followed.any()
+    projector, lasting = exact(onto_followed), exact(np.eye(n)) - exact(onto_followed)
     moving = phi @ projector
     m = block([[moving, exact(np.zeros((n, len(az))))], [k if followed else exact(np.zeros(k.shape)), exact(az)]])
     c = np.hstack([j.midpoint if followed else np.zeros(j.shape), cz])

@@ -300,8 +300,8 @@ def _whitened(
         completed[:, seen] = row[:, seen]
         completed[:, ~seen] += regression @ away
         row = completed
-    kept = np.concatenate([row[:, None], past[:, :-1]], axis=1) if model.order else past
-    return kept, np.asarray(model.whitener @ (row - predicted))
+    past_after = np.concatenate([row[:, None], past[:, :-1]], axis=1) if model.order else past
+    return past_after, np.asarray(model.whitener @ (row - predicted))
 
 
 def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[FloatArray, FloatArray]:

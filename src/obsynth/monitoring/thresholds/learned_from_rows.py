@@ -289,20 +289,20 @@ def complete_rows(design: ObserverDesign, learned: LearnedThresholds, rows: Floa
 def _usual_scores(scores: Scores, complete: NDArray[np.bool_]) -> Scores | None:
     """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
     them."""
-    kept = replace(
+    usual = replace(
         scores,
         score=np.where(complete[:, None], scores.score, 0.0),
         information=np.where(complete[:, None, None], scores.information, 0.0),
         theta=np.where(complete[:, None], scores.theta, np.nan),
     )
-    return kept if kept.chosen(slice(len(complete) // 2)).determine and kept.determine else None
+    return usual if usual.chosen(slice(len(complete) // 2)).determine and usual.determine else None
 
 
-def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+def signatures(design: ObserverDesign, places: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
     """Return directions ``(s, m)`` of a step in the columns that are watched, of deviations ``sizes (m,)``, and what
     each shows: a column alone, and what a constant fault of a linear design does to all of them where this is another
     direction."""
-    names = [watched_names(design)[i] for i in kept]
+    names = [watched_names(design)[i] for i in places]
     directions = list(np.diag(sizes))
     if not isinstance(design.observer, LinearObserver) or expects_fault_profiles(design):
         return np.array(directions), tuple(names)
@@ -311,7 +311,7 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     c, direct, *_ = errors.output(slice(len(observer.state_names), None))
     held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
     try:
-        gains = (direct - c @ np.linalg.solve(held, errors.fault))[kept]
+        gains = (direct - c @ np.linalg.solve(held, errors.fault))[places]
     except np.linalg.LinAlgError:
         return np.array(directions), tuple(names)
     for name, gain in zip(plant.fault_names, gains.T, strict=True):
@@ -336,7 +336,7 @@ def varying(rows: FloatArray, first: int) -> list[int]:
 
 def independent(rows: FloatArray) -> list[int]:
     """Return the columns of ``(n, m)`` that those before them do not explain."""
-    kept: list[int] = []
+    independent_columns: list[int] = []
     basis = np.zeros((len(rows), 0))
     for i, column in enumerate(rows.T):
         residual = column - column.mean()
@@ -345,6 +345,6 @@ def independent(rows: FloatArray) -> list[int]:
         for _ in range(2):
             residual = residual - basis @ (basis.T @ residual)
         if power > 0.0 and float(residual @ residual) > LEAST_NEW * power:
-            kept.append(i)
+            independent_columns.append(i)
             basis = np.column_stack([basis, residual / np.linalg.norm(residual)])
-    return kept
+    return independent_columns

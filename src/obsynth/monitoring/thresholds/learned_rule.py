@@ -123,9 +123,9 @@ class LearnedRule(Rule):
             state = self._followed(self._added(state, None), sample.observation)
         else:
             watched = values_of_row[self._places]
-            kept = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
+            filled = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
             state = self._followed(
-                self._added(state, kept, most, evidence), sample.observation, np.isfinite(watched), counts=counts
+                self._added(state, filled, most, evidence), sample.observation, np.isfinite(watched), counts=counts
             )
         # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
         # stands is not ended by outputs that are left out.
@@ -170,8 +170,8 @@ class LearnedRule(Rule):
         before, scores = sample_score(state.before, observation, self._walk, missing + 1)
         row = np.concatenate([scores.away(self.learned.centres), np.diag(scores.information)])
         gone = min(missing, max(AGES))
-        kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
-        return state._replace(before=before, scores=kept)
+        newest_scores = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
+        return state._replace(before=before, scores=newest_scores)
 
     def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
         """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,

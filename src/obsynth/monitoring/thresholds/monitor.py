@@ -78,8 +78,10 @@ def statement_of(
         held = HELD if model.sampled is None else BOUNDS_AND_HELD_INPUTS
         ending = held if model.continuous is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
     words_of_numbers = {name: shown(value) for name, value in numbers.items()}
-    kept = "" if assumed is None else assumed.bounds_phrase
-    words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **words_of_numbers)
+    assumptions = "" if assumed is None else assumed.bounds_phrase
+    words = (STATEMENTS[kind] + "{kept}" + ending).format(
+        kept=f", with {assumptions}" if assumptions else "", **words_of_numbers
+    )
     return (OF_ESTIMATES if estimates else "") + words
 
 

@@ -113,10 +113,10 @@ def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     units = np.sqrt(np.einsum("kii->ki", information).mean(axis=0))
     sizes, vectors = np.linalg.eigh(information / np.outer(units, units))
     sizes = np.maximum(sizes, 0.0)
-    kept = sizes > DIRECTION_SHARE * np.maximum(sizes[:, -1:], SMALLEST)
-    lengths = np.sqrt(np.where(kept, sizes, 0.0))
+    determined = sizes > DIRECTION_SHARE * np.maximum(sizes[:, -1:], SMALLEST)
+    lengths = np.sqrt(np.where(determined, sizes, 0.0))
     with np.errstate(divide="ignore"):
-        inverse = np.where(kept, 1.0 / lengths, 0.0)
+        inverse = np.where(determined, 1.0 / lengths, 0.0)
     turned = np.swapaxes(vectors, 1, 2)
     return units[:, None] * ((vectors * lengths[:, None, :]) @ turned), (vectors * inverse[:, None, :]) @ turned / units
 

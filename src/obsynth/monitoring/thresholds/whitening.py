@@ -63,8 +63,8 @@ def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
 def whitener_of(covariance: FloatArray) -> FloatArray:
     """Return ``Wh (rank, n)`` with ``Wh S Wh' = I`` for ``S (n, n)``; directions without any variance are left out."""
     sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
-    kept = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
-    return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T)
+    significant = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
+    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T)
 
 
 def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
@@ -75,10 +75,10 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     error = np.hstack([-predict, np.eye(count)])
     innovation_covariance = error @ covariance @ error.T
     sizes, vectors = np.linalg.eigh((innovation_covariance + innovation_covariance.T) / 2.0)
-    kept = sizes > CANCELLATION_TOLERANCE * float(np.max(np.abs(np.diag(covariance))))
-    if not kept.any():
+    significant = sizes > CANCELLATION_TOLERANCE * float(np.max(np.abs(np.diag(covariance))))
+    if not significant.any():
         raise SpecError("The newest residual is determined by the older ones: it has no innovation.", path="window")
-    return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T @ error)
+    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T @ error)
 
 
 def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) -> float:

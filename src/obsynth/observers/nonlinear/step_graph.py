@@ -111,10 +111,10 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
     F, G, noise, scaled = local
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
     added = noise @ ca.DM(observer.Q) @ noise.T + missing
-    kept = ca.DM.eye(observer.model.nx) - K @ H
-    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "missing": missing, "kept": F @ kept,
+    error_map = ca.DM.eye(observer.model.nx) - K @ H
+    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "missing": missing, "kept": F @ error_map,
              "scaled": scaled}  # fmt: skip
-    carried = F @ (kept @ before["Upsilon"] - K @ L)
+    carried = F @ (error_map @ before["Upsilon"] - K @ L)
     if observer.form != "forgetting":
         # The parameters of a sample act in the step that leads there: they have walked already.
         after["spread"] = walked = spread + ca.DM(observer.random_walk)
@@ -123,7 +123,7 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
         P = F @ P @ F.T + through + through.T + G @ walked @ G.T + added
         after["cross"] = F @ before["cross"] + G @ walked
     else:
-        P = F @ (kept @ P @ kept.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
+        P = F @ (error_map @ P @ error_map.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
     if observer.form == "random-walk" and observer.random_walk.any():
         # What was learnt holds for the parameters before their walk: a share of it holds for those after, and what
         # that leaves open is noise of the state alone (Hsieh and Chen 1999), so that both stay uncorrelated.
@@ -194,9 +194,9 @@ class _Update:
         weight = self.R if observer.weight == "paper" else Sigma
         gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
         S = prior - gain @ Omega @ prior
-        kept = ca.DM.eye(observer.model.nq) - gain @ Omega
+        error_map = ca.DM.eye(observer.model.nq) - gain @ Omega
         theta = self._bounded(arrays["theta"] + gain @ arrays["innovation"])
-        spread = kept @ spread @ kept.T + gain @ Sigma @ gain.T
+        spread = error_map @ spread @ error_map.T + gain @ Sigma @ gain.T
         after = {
             "S": 0.5 * (S + S.T),
             "spread": 0.5 * (spread + spread.T),
@@ -215,8 +215,8 @@ class _Update:
             return S / observer.forgetting
         identity = ca.MX(ca.DM.eye(observer.model.nq))
         start = np.linalg.inv(observer.initial_parameter_covariance) if observer.model.nq else np.zeros((0, 0))
-        kept = observer.forgetting * definite_solved(S, identity) + (1.0 - observer.forgetting) * ca.DM(start)
-        prior = definite_solved(kept, identity)
+        information = observer.forgetting * definite_solved(S, identity) + (1.0 - observer.forgetting) * ca.DM(start)
+        prior = definite_solved(information, identity)
         return 0.5 * (prior + prior.T)
 
     def _bounded(self, theta: Any) -> Any:
@@ -231,9 +231,9 @@ class _Update:
         full_H, full_L, e, H, _ = self._received_outputs(arrays)
         P = arrays["P"]
         K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
-        kept = ca.DM.eye(self.observer.model.nx) - K @ full_H
-        through = kept @ arrays["Upsilon"] - K @ full_L
-        own = kept @ P @ kept.T + K @ ca.DM(self.observer.R) @ K.T
+        error_map = ca.DM.eye(self.observer.model.nx) - K @ full_H
+        through = error_map @ arrays["Upsilon"] - K @ full_L
+        own = error_map @ P @ error_map.T + K @ ca.DM(self.observer.R) @ K.T
         covariance = own + through @ arrays["spread"] @ through.T
         return {**arrays, "H": full_H, "L": full_L, "K": K, "posterior": arrays["x"] + K @ e, "covariance": covariance}
 
@@ -247,8 +247,8 @@ class _Update:
             gain = definite_solved(rows @ joint @ rows.T + self.R, rows @ joint).T @ mask
         else:
             gain = ca.vertcat(definite_solved(H @ P @ H.T + self.R, H @ P).T @ mask, ca.DM.zeros(nq, mask.shape[0]))
-        kept = ca.DM.eye(nx + nq) - gain @ rows
-        joint = kept @ joint @ kept.T + gain @ self.R @ gain.T
+        error_map = ca.DM.eye(nx + nq) - gain @ rows
+        joint = error_map @ joint @ error_map.T + gain @ self.R @ gain.T
         joint = 0.5 * (joint + joint.T)
         correction = gain @ arrays["innovation"]
         after = {

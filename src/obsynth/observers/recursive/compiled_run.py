@@ -216,9 +216,9 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(matrices, rows[:, :, None])[:, :, 0])
 
 
-def _fill(record: dict[str, FloatArray], kept: slice, *parts: FloatArray) -> None:
+def _fill(record: dict[str, FloatArray], rows: slice, *parts: FloatArray) -> None:
     """Keep some samples: states, their deviations, parameters, their covariances, and innovations ``(..., any)``."""
     for name, part in zip(("states", "state_deviations", "faults", "fault_covariances"), parts[:4], strict=True):
-        record[name][kept] = part
-    record["innovations"][kept, : parts[4].shape[-1]] = parts[4]
-    record["nis_degrees"][kept] = parts[4].shape[-1]
+        record[name][rows] = part
+    record["innovations"][rows, : parts[4].shape[-1]] = parts[4]
+    record["nis_degrees"][rows] = parts[4].shape[-1]

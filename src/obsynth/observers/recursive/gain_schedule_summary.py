@@ -86,24 +86,27 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     plain = observer.without_walk
     all_steps = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, all_steps)), [], None
-    kept: tuple[float, str] | None = None
+    early_contraction: tuple[float, str] | None = None
     middle: FloatArray | None = None
     for gain_step in gains(plain, steps):
-        last, kept = gain_step, None
+        last, early_contraction = gain_step, None
         regressors.append(gain_step.G)
         product.move(gain_step.gain[:, : len(gain_step.step.A)] @ gain_step.step.A)
         if product.done == product.steps // 2:
             middle = gain_step.gain
         if product.done == product.steps < all_steps:
             shrinks = product.contraction()[0] < 1.0
-            if (shrinks or (kept := product.contraction_of_kept_gains()) is not None) and (
+            if (shrinks or (early_contraction := product.contraction_of_kept_gains()) is not None) and (
                 plain.plant.nx > MANY_STATES or _stays(gain_step.gain, middle)
             ):
                 break
             product.go_on_to(end_of_steps(FOLLOW_FURTHER * product.steps, all_steps))
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
-    (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
+    (contraction, span), ne = (
+        early_contraction if early_contraction is not None else product.contraction(),
+        len(last.step.A),
+    )
     settled = settled_contraction(plain) if contraction >= 1.0 else None
     settles = settled is not None and settled < 1.0 - BOUNDARY_TOLERANCE
     if settled is not None and settles:

@@ -292,5 +292,5 @@ def _root(P: FloatArray) -> FloatArray:
     deviations = np.sqrt(np.maximum(np.diag(P), 0.0))
     scale = np.where(deviations > 0.0, deviations, 1.0)
     values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-    kept = values > NEGLIGIBLE_SHARE * values[-1]
-    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    significant = values > NEGLIGIBLE_SHARE * values[-1]
+    return np.asarray(scale[:, None] * vectors[:, significant] * np.sqrt(values[significant]))

@@ -45,9 +45,14 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
     # States may differ: a method may have eliminated some, and then derivatives of known inputs are inputs as well, and
     # outputs that need those of other signals are left out.
     inputs, outputs = spec.plant.input_names, design.plant.output_names
-    kept = tuple(name for name in design.plant.input_names if name in inputs or derivative_of(name, inputs) is None)
-    left = set(spec.plant.output_names) - set(outputs) if _is_of_high_index(spec.plant) else set()
-    if kept != inputs or tuple(name for name in spec.plant.output_names if name not in left) != outputs:
+    own_inputs = tuple(
+        name for name in design.plant.input_names if name in inputs or derivative_of(name, inputs) is None
+    )
+    omitted_outputs = set(spec.plant.output_names) - set(outputs) if _is_of_high_index(spec.plant) else set()
+    if (
+        own_inputs != inputs
+        or tuple(name for name in spec.plant.output_names if name not in omitted_outputs) != outputs
+    ):
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
     own, stated = (getattr(plant, "constants", None) or {} for plant in (design.plant, spec.plant))
     others = [name for name, value in own.items() if stated.get(name, value) != value]

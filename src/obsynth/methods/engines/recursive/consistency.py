@@ -98,14 +98,14 @@ class _Drawn:
     """Standard normal numbers from the fixed seed, in the order in which they are asked for."""
 
     def __init__(self) -> None:
-        self.left, state = _first_numbers()
+        self.unused, state = _first_numbers()
         self.further = np.random.default_rng(CONSISTENCY_SEED)
         self.further.bit_generator.state = state
 
     def next(self, columns: int) -> FloatArray:
         """Return the next numbers, ``(trials, columns)``."""
         count = CONSISTENCY_TRIALS * columns
-        taken, self.left = self.left[:count], self.left[count:]
+        taken, self.unused = self.unused[:count], self.unused[count:]
         if len(taken) < count:
             taken = np.concatenate([taken, self.further.standard_normal(count - len(taken))])
         return taken.reshape(CONSISTENCY_TRIALS, columns)
