@@ -26,7 +26,7 @@ PLANT = DescriptorSystem(
 
 def matrix_of(said: FullRank) -> np.ndarray:
     """The matrix of a statement, put together by numpy alone."""
-    rows = [[None if name is None else getattr(PLANT, name)[:, said.kept.get(name, slice(None))] for name in row]
+    rows = [[None if name is None else getattr(PLANT, name)[:, said.columns.get(name, slice(None))] for name in row]
             for row in said.blocks]  # fmt: skip
     heights = [next(part.shape[0] for part in row if part is not None) for row in rows]
     widths = [next(row[j].shape[1] for row in rows if row[j] is not None) for j in range(len(rows[0]))]
@@ -42,7 +42,7 @@ def matrix_of(said: FullRank) -> np.ndarray:
         FullRank([["E"], ["C"]]),
         FullRank([["C"]], of_rows=True),
         FullRank([["E"], ["C"], ["A"]], last_rows=[2]),
-        FullRank([["Bd"], ["Dd"]], kept={"Bd": [1], "Dd": [1]}),
+        FullRank([["Bd"], ["Dd"]], columns={"Bd": [1], "Dd": [1]}),
         FullRank([["Bd"], ["Dd"]]),
         FullRank([["E", None, "Bd"], ["C", "Df", None]]),
         NoZeroOutside("Bf").at_zero,

@@ -190,8 +190,8 @@ def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> T
         for j in range(i, VERTICES):
             one, other = plant.vertices[i], plant.vertices[j]
             A.append(0.5 * ((eye - K[i] @ C) @ T @ other.A + (eye - K[j] @ C) @ T @ one.A))
-            left = 0.5 * ((eye - K[i] @ C) @ T @ other.Bf + (eye - K[j] @ C) @ T @ one.Bf)
-            leaks.append(float(np.abs(left).max(initial=0.0)))
+            effects = 0.5 * ((eye - K[i] @ C) @ T @ other.Bf + (eye - K[j] @ C) @ T @ one.Bf)
+            leaks.append(float(np.abs(effects).max(initial=0.0)))
     errors = ErrorPolytope(A, np.zeros((0, plant.nx)), dt=plant.dt)
     return TurningErrors(errors, max(leaks) / largest if largest else 0.0)
 

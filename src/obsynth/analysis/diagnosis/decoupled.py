@@ -39,9 +39,9 @@ class DecoupledPlant:
     C : FloatArray
         ``(p, k)``.
     Bu, By, F, N : FloatArray
-        ``(k, nu)``, ``(k, ny)``, ``(k, faults kept)``, ``(k, nw)``.
+        ``(k, nu)``, ``(k, ny)``, ``(k, estimated faults)``, ``(k, nw)``.
     Du, H, G, M : FloatArray
-        ``(p, nu)``, ``(p, ny)``, ``(p, faults kept)``, ``(p, nw)``.
+        ``(p, nu)``, ``(p, ny)``, ``(p, estimated faults)``, ``(p, nw)``.
     rows : FloatArray
         ``(k + p, nx + ny)``: the combinations of the plant's equations, and of its outputs, that these rows are.
     states : FloatArray
@@ -52,7 +52,7 @@ class DecoupledPlant:
     source : DescriptorSystem
         The plant.
     faults : tuple of str
-        The faults kept, in the order of the columns of F.
+        The faults to be estimated, in the order of the columns of F.
     without : tuple of str
         What was removed: the unknown inputs, and faults that are not to show.
     fault_sizes : FloatArray
@@ -171,13 +171,13 @@ def decouple(
     """
     plant = linear_plant(plant)
     removed = fault_numbers(plant, without, "without")
-    kept = (
+    estimated = (
         [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")
     )
-    contradictory = [plant.fault_names[i] for i in kept if i in removed]
+    contradictory = [plant.fault_names[i] for i in estimated if i in removed]
     if contradictory:
         raise SpecError(f"{', '.join(contradictory)}: a fault cannot be kept and removed.", path="without")
-    return decoupled(plant, removed, kept)
+    return decoupled(plant, removed, estimated)
 
 
 def fault_numbers(plant: DescriptorSystem, names: Sequence[str], where: str) -> list[int]:
@@ -192,8 +192,8 @@ def fault_numbers(plant: DescriptorSystem, names: Sequence[str], where: str) -> 
     return [plant.fault_names.index(name) for name in dict.fromkeys(listed)]
 
 
-def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[int]) -> DecoupledPlant:
-    """Remove the unknown inputs and the faults ``removed`` from a plant; keep the columns ``kept``."""
+def decoupled(plant: DescriptorSystem, removed: Sequence[int], estimated: Sequence[int]) -> DecoupledPlant:
+    """Remove the unknown inputs and the faults ``removed`` from a plant; keep those that are ``estimated``."""
     nx, ny = plant.nx, plant.ny
     pencil_e, pencil_a = unknowns_pencil(plant, removed)
     units = PencilUnits.of(pencil_e, pencil_a, sampled=plant.is_discrete)
@@ -205,7 +205,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
     rows[part.order :, :nx] = _without_dynamics(rows[part.order :, :nx], moving)
     rows = np.where(np.abs(rows) > ROTATION_ROUNDING, rows, 0.0) * units.rows
-    faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
+    faults = np.vstack([plant.Bf, plant.Df])[:, list(estimated)]
     signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
     k = part.order
@@ -231,7 +231,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         states=read_only((part.right / units.columns)[:, :nx]),
         removed=finite_values(part) * units.time,
         source=plant,
-        faults=tuple(plant.fault_names[i] for i in kept),
+        faults=tuple(plant.fault_names[i] for i in estimated),
         without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
         fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)),
         signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)),

@@ -57,17 +57,17 @@ class Removal:
     @cached_property
     def plant(self) -> DecoupledPlant:
         """The decoupled plant with all other faults."""
-        return decoupled(self.source, self.removed, self.kept)
+        return decoupled(self.source, self.removed, self.estimated)
 
     @cached_property
-    def kept(self) -> list[int]:
+    def estimated(self) -> list[int]:
         """The other faults."""
         gone = set(self.removed)
         return [j for j in range(self.source.nf) if j not in gone]
 
     @cached_property
     def traces(self) -> tuple[FloatArray, FloatArray]:
-        """Sizes ``(len(kept),)`` of the faults' columns before the reduction, and of what is left, relative to them."""
+        """Sizes of the columns of the ``estimated`` faults before the reduction, and what is left, relative to them."""
         sizes = np.maximum(self.plant.fault_sizes, np.finfo(np.float64).tiny)
         return sizes, np.linalg.norm(np.vstack([self.plant.F, self.plant.G]) / sizes, axis=0)
 
@@ -75,9 +75,9 @@ class Removal:
     def residual_orders(self) -> dict[int, int]:
         """Least order of a scalar residual that shows a fault, of those that leave a trace."""
         plant, (sizes, traces) = self.plant, self.traces
-        places = [place for place in range(len(self.kept)) if traces[place] > TRACE_TOLERANCE]
+        places = [place for place in range(len(self.estimated)) if traces[place] > TRACE_TOLERANCE]
         if plant.order == 0 or not places:
-            return {self.kept[place]: 0 for place in places}
+            return {self.estimated[place]: 0 for place in places}
         inverse = np.linalg.inv(plant.E * plant.time)
         units = (sizes * traces)[places]
         known = plant.signals
@@ -89,7 +89,7 @@ class Removal:
             inverse @ known[: plant.order],
             known[plant.order :],
         )
-        return {self.kept[place]: order for place, order in zip(places, orders, strict=True) if order is not None}
+        return {self.estimated[place]: order for place, order in zip(places, orders, strict=True) if order is not None}
 
     def pencil(self, *more: int) -> ExactPencil:
         """Return the pencil of the unknowns, with more faults among them."""
@@ -130,7 +130,7 @@ class DecoupledFault:
     @cached_property
     def plant(self) -> DecoupledPlant:
         """The decoupled plant, in floating point."""
-        reduced, place = self.removal.plant, [self.removal.kept.index(self.number)]
+        reduced, place = self.removal.plant, [self.removal.estimated.index(self.number)]
         return replace(
             reduced,
             F=reduced.F[:, place],

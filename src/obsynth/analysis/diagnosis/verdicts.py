@@ -46,13 +46,13 @@ def residual_bank(faults: DecoupledFaults, whole_bank: bool = False) -> tuple[St
     """Return the structured residuals that exist, those that see least first: all, or those of `_sets`."""
     residuals, plant = [], faults.source
     for removed in _sets(plant.nf, whole_bank):
-        kept = [i for i in range(plant.nf) if i not in removed]
-        decoupled = [faults.of(removed, i) for i in kept]
+        remaining = [i for i in range(plant.nf) if i not in removed]
+        decoupled = [faults.of(removed, i) for i in remaining]
         if not all(fault.visible for fault in decoupled):
             continue
         orders = [fault.residual_order for fault in decoupled]
         known = [order for order in orders if order is not None]
-        sets = (kept, removed, [fault.number for fault in decoupled if fault.shows_at_rest])
+        sets = (remaining, removed, [fault.number for fault in decoupled if fault.shows_at_rest])
         sees, blind, at_rest = (tuple(plant.fault_names[i] for i in chosen) for chosen in sets)
         residuals.append(StructuredResidual(sees, blind, at_rest, max(known) if len(known) == len(orders) else None))
     return tuple(sorted(residuals, key=lambda residual: len(residual.sees)))

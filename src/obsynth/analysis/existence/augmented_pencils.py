@@ -124,12 +124,12 @@ def _exact_pencil(
     judge: Evaluator, numbers: PlantNumbers, model: Exosystem
 ) -> tuple[PlantNumbers, Any, Any, list[int]]:
     """Return the augmented plant on the numbers as written, Bda and Dd, and the disturbances kept in these."""
-    kept = judge.kept_disturbances
-    bd, dd = (numbers.columns(name, kept) for name in ("Bd", "Dd"))
+    disturbances = judge.independent_disturbances
+    bd, dd = (numbers.columns(name, disturbances) for name in ("Bd", "Dd"))
     below = numbers.zeros(judge.plant.nx + model.order, 0)
-    if kept:
-        below = blocks([[bd], [numbers.zeros(model.order, len(kept))]])
-    return _augmented(numbers, judge.plant, model), below, dd, kept
+    if disturbances:
+        below = blocks([[bd], [numbers.zeros(model.order, len(disturbances))]])
+    return _augmented(numbers, judge.plant, model), below, dd, disturbances
 
 
 def exact_drops(judge: Evaluator, model: Exosystem) -> tuple[SystemFacts, list[int]] | None:
@@ -140,8 +140,8 @@ def exact_drops(judge: Evaluator, model: Exosystem) -> tuple[SystemFacts, list[i
         return None
 
     def decided() -> tuple[SystemFacts, list[int]]:
-        augmented, below, direct, kept = _exact_pencil(judge, numbers, model)
-        return augmented.system(below, direct), kept
+        augmented, below, direct, disturbances = _exact_pencil(judge, numbers, model)
+        return augmented.system(below, direct), disturbances
 
     key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
     facts: tuple[SystemFacts, list[int]] = numbers.remembered(key, decided)
@@ -153,9 +153,9 @@ def exact_loss(judge: Evaluator, model: Exosystem, value: complex) -> int | None
     factor = _factor_of(model, value)
     if judge.numbers is None or factor is None:
         return None
-    augmented, below, direct, kept = _exact_pencil(judge, judge.numbers, model)
+    augmented, below, direct, disturbances = _exact_pencil(judge, judge.numbers, model)
     rank = augmented.rank_at_root(below, direct, factor)
-    return None if rank is None else judge.plant.nx + model.order + len(kept) - rank
+    return None if rank is None else judge.plant.nx + model.order + len(disturbances) - rank
 
 
 def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> PlantNumbers:

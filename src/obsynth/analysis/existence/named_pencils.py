@@ -229,11 +229,11 @@ def named_pencil(
     units: PlantUnits,
     layout: Sequence[Sequence[Cell]],
     *,
-    kept: Mapping[str, Sequence[int]] | None = None,
+    taken_columns: Mapping[str, Sequence[int]] | None = None,
 ) -> NamedPencil:
     """Return a block matrix of the plant's matrices by name, such as ``[["A", "Bf"], ["C", "Df"]]``, minus s times E.
-    ``kept``: the columns of a matrix that are taken, all by default.  E by name stands for itself, not for s."""
-    exact, chosen, sized = rational_matrices(plant), kept or {}, sized_plant(plant)
+    ``taken_columns``: those of a matrix, all by default.  E by name stands for itself, not for s."""
+    exact, chosen, sized = rational_matrices(plant), taken_columns or {}, sized_plant(plant)
     scale = {"x": units.states, "f": units.faults, "d": units.disturbances}
     kinds = {"E": "x", "A": "x", "C": "x", "Bf": "f", "Df": "f", "Bd": "d", "Dd": "d"}
     widths, columns = list[list[int]](), list[FloatArray]()
@@ -274,11 +274,13 @@ def named_pencil(
 
 
 def named_augmented(
-    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, *, kept: Sequence[int], of_the_model: bool
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, *, independent: Sequence[int], of_the_model: bool
 ) -> NamedPencil:
-    """Return ``[A - s E, Bf Cw, Bd; 0, Phi - s, 0; C, Df Cw, Dd]``; entries of Phi are named ``of_the_model`` only."""
+    """Return ``[A - s E, Bf Cw, Bd; 0, Phi - s, 0; C, Df Cw, Dd]`` with the ``independent`` disturbances.
+
+    Entries of Phi are named ``of_the_model`` only."""
     layout = [["A", "Bf", "Bd"], ["C", "Df", "Dd"]]
-    pencil = named_pencil(plant, units, layout, kept={"Bd": kept, "Dd": kept})
+    pencil = named_pencil(plant, units, layout, taken_columns={"Bd": independent, "Dd": independent})
     nx, nf, count = plant.nx, plant.nf, model.order
     cw, phi = rational(model.Cw), rational(model.Phi)
     states, faults, disturbances = np.split(np.arange(pencil.A.shape[1]), [nx, nx + nf])

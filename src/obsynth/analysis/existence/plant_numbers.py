@@ -106,9 +106,9 @@ class PlantNumbers:
         with self._with_many_bits():
             return rank_of(matrix) if self.exact else rank_to_digits(matrix.tolist())
 
-    def columns(self, name: str, kept: Sequence[int] | None) -> Any:
+    def columns(self, name: str, columns: Sequence[int] | None) -> Any:
         """Return a matrix by its name, or some of its columns."""
-        return self.matrices[name] if kept is None else picked_columns(self.matrices[name], kept)
+        return self.matrices[name] if columns is None else picked_columns(self.matrices[name], columns)
 
     def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
         """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""

@@ -132,8 +132,8 @@ def _decided(judge: Evaluator, model: Exosystem) -> Existence:
 
 def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits) -> Condition:
     """Decide (D2) on the numbers of the plant as given, or in floating point."""
-    kept = judge.kept_disturbances
-    inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
+    disturbances = judge.independent_disturbances
+    inputs, direct = plant.Bd[:, disturbances], plant.Dd[:, disturbances]
 
     def holding(facts: SystemFacts) -> Condition:
         return _zeros(True, facts.normal_rank, facts.columns, f"{counted(len(facts.zeros), 'stable zero')}")
@@ -146,7 +146,7 @@ def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits
         point = units.rate * max(facts.outside, key=lambda value: instability(value, plant.dt))
         return _zero_failure(plant, units, zero_at(plant.E, plant.A, point, inputs, plant.C, direct), inputs, direct)
 
-    return judge.no_zero_outside(NoZeroOutside("Bd", kept), holding=holding, lost=lost, what="observer")
+    return judge.no_zero_outside(NoZeroOutside("Bd", disturbances), holding=holding, lost=lost, what="observer")
 
 
 def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:

@@ -154,9 +154,9 @@ def decoupling_condition(judge: Evaluator, before: str, after: str) -> Condition
     if decision.means != "unclear":
         return condition
     # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
-    kept = judge.kept_disturbances
-    free = [j for j in kept if not plant.Dd[:, j].any()]
-    direct = [j for j in kept if j not in free]
+    disturbances = judge.independent_disturbances
+    free = [j for j in disturbances if not plant.Dd[:, j].any()]
+    direct = [j for j in disturbances if j not in free]
     layout: list[list[str | None]] = (
         [["E", "Bd"], ["C", None]] if not direct else [["E", "Bd", None], ["C", None, "Dd"]]
     )

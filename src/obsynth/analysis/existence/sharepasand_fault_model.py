@@ -135,7 +135,9 @@ def _model_condition(
 
 def _named(judge: Evaluator, model: Exosystem, *, of_the_model: bool) -> NamedPencil:
     """Return plant and fault model as a pencil of which each entry is known by its name."""
-    return named_augmented(judge.plant, model, judge.units, kept=judge.kept_disturbances, of_the_model=of_the_model)
+    return named_augmented(
+        judge.plant, model, judge.units, independent=judge.independent_disturbances, of_the_model=of_the_model
+    )
 
 
 def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:

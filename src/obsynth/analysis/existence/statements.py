@@ -132,7 +132,7 @@ class FullRank:
     """Blocks, the plant's matrices by name (``None``: zero), make up a matrix of full column rank."""
 
     blocks: Sequence[Sequence[str | None]]
-    kept: Mapping[str, Sequence[int]] = field(default_factory=dict)  # columns of a matrix that are taken
+    columns: Mapping[str, Sequence[int]] = field(default_factory=dict)  # columns of a matrix that are taken
     last_rows: Sequence[int] | None = None  # those that are taken of the last row of blocks
     of_rows: bool = False  # full row rank instead
     rank: int | None = None  # what is to be had, where that is less
@@ -143,7 +143,7 @@ class NoZeroOutside:
     """``[A - s E, inputs; C, direct]`` keeps full column rank on and outside the boundary of stability."""
 
     inputs: Literal["", "Bf", "Bd"] = ""
-    kept: Sequence[int] | None = None  # columns of these that are taken
+    columns: Sequence[int] | None = None  # columns of these that are taken
 
     @property
     def at_zero(self) -> FullRank:
@@ -151,8 +151,8 @@ class NoZeroOutside:
         if not self.inputs:
             return FullRank([["A"], ["C"]])
         beside = (self.inputs, f"D{self.inputs[1:]}")
-        kept = {} if self.kept is None else dict.fromkeys(beside, self.kept)
-        return FullRank([["A", beside[0]], ["C", beside[1]]], kept)
+        columns = {} if self.columns is None else dict.fromkeys(beside, self.columns)
+        return FullRank([["A", beside[0]], ["C", beside[1]]], columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +179,14 @@ class Evaluator:
         return self.units.scaled_plant(self.plant)
 
     @cached_property
-    def kept_disturbances(self) -> list[int]:
+    def independent_disturbances(self) -> list[int]:
         """The unknown inputs that are no combinations of those before them."""
-        kept = list[int]()
+        independent = list[int]()
         for column in range(self.plant.nd):
-            statement = FullRank([["Bd"], ["Dd"]], {name: [*kept, column] for name in ("Bd", "Dd")})
-            if self.rank_itself(statement) == len(kept) + 1:
-                kept.append(column)
-        return kept
+            statement = FullRank([["Bd"], ["Dd"]], {name: [*independent, column] for name in ("Bd", "Dd")})
+            if self.rank_itself(statement) == len(independent) + 1:
+                independent.append(column)
+        return independent
 
     @cached_property
     def terms(self) -> DescriptorSystem | None:
@@ -198,7 +198,7 @@ class Evaluator:
         names = [next(name for name in row if name) for row in statement.blocks]
         columns = [next(row[j] or "" for row in statement.blocks if row[j]) for j in range(len(statement.blocks[0]))]
         widths = [
-            len(statement.kept[name]) if name in statement.kept else getattr(self.plant, name).shape[1]
+            len(statement.columns[name]) if name in statement.columns else getattr(self.plant, name).shape[1]
             for name in columns
         ]
         return [getattr(self.plant, name).shape[0] for name in names], widths
@@ -210,7 +210,7 @@ class Evaluator:
             if name is None:
                 return np.zeros((height, width))
             matrix: FloatArray = getattr(plant, name)
-            return matrix[:, list(statement.kept[name])] if name in statement.kept else matrix
+            return matrix[:, list(statement.columns[name])] if name in statement.columns else matrix
 
         heights, widths = self._sizes(statement)
         rows = [
@@ -229,7 +229,7 @@ class Evaluator:
         def block(name: str | None, height: int, width: int) -> Any:
             if name is None:
                 return numbers.zeros(height, width)
-            return numbers.columns(name, statement.kept.get(name))
+            return numbers.columns(name, statement.columns.get(name))
 
         heights, widths = self._sizes(statement)
         rows = [
@@ -285,7 +285,7 @@ class Evaluator:
 
     def named(self, statement: FullRank) -> NamedPencil:
         """Return the blocks as a pencil of which each entry is known by its name."""
-        return named_pencil(self.plant, self.units, statement.blocks, kept=statement.kept)
+        return named_pencil(self.plant, self.units, statement.blocks, taken_columns=statement.columns)
 
     def doubt(
         self,
@@ -315,7 +315,7 @@ class Evaluator:
     ) -> tuple[FloatArray, FloatArray]:
         """Return a pencil in units of the plant's own, time among them: no answer may hang on those of the data."""
         scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[statement.inputs]
-        scales = scales if statement.kept is None else scales[list(statement.kept)]
+        scales = scales if statement.columns is None else scales[list(statement.columns)]
         rate = np.concatenate([np.full(self.plant.nx, self.units.rate), np.ones(self.plant.ny)])[:, None]
         own = self.units.scaled_pencil(moving, matrix, scales)
         return own[0], rate * own[1]
@@ -341,7 +341,7 @@ class Evaluator:
             return self.floating_facts(statement)
         if not statement.inputs:
             return numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
-        return numbers.system(*(numbers.columns(str(row[1]), statement.kept) for row in statement.at_zero.blocks))
+        return numbers.system(*(numbers.columns(str(row[1]), statement.columns) for row in statement.at_zero.blocks))
 
     def verdict(self, statement: NoZeroOutside) -> ZeroVerdict:
         """Decide where the zeros of a pencil are."""

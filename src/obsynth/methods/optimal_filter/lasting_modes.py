@@ -44,15 +44,21 @@ def with_growing_modes_reached(plant: DescriptorSystem, drive: float | None = No
 
 def _with_drives(plant: DescriptorSystem, drive: float, name: str, *, grows: bool | None) -> DescriptorSystem:
     units = PlantUnits.of(plant).rounded()
-    left, own = units.equations[:, None], units.states
-    columns = _undriven(left * plant.E * own, left * plant.A * own, left * plant.Bw, plant.is_discrete, grows)
+    equation_units, own = units.equations[:, None], units.states
+    columns = _undriven(
+        equation_units * plant.E * own,
+        equation_units * plant.A * own,
+        equation_units * plant.Bw,
+        plant.is_discrete,
+        grows,
+    )
     count = columns.shape[1]
     if not count:
         return plant
-    noise = np.vstack([left * plant.Bw, units.outputs[:, None] * plant.Dw])
+    noise = np.vstack([equation_units * plant.Bw, units.outputs[:, None] * plant.Dw])
     size = drive * (float(np.max(np.abs(noise), initial=0.0)) or 1.0)
     return plant.replace(
-        Bw=np.hstack([plant.Bw, size * columns / left]),
+        Bw=np.hstack([plant.Bw, size * columns / equation_units]),
         Dw=np.hstack([plant.Dw, np.zeros((plant.ny, count))]),
         noise_names=[
             *plant.noise_names,

@@ -209,10 +209,10 @@ def _followed(
     e, own, _, dd_past = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
     bd = np.vstack([plant.Bd, np.zeros((na - plant.nx, plant.nd))])
-    left = _left_kernel(e)
+    left_kernel = _left_kernel(e)
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
     # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
-    sizes = [nz * na, nz * count, rows * len(left), rows * count]
+    sizes = [nz * na, nz * count, rows * len(left_kernel), rows * count]
 
     def equations(*parts: Any) -> Any:
         height = next(len(part) for part in parts if part is not None)
@@ -225,8 +225,8 @@ def _followed(
         [
             equations(np.kron(a, e.T) - np.kron(states, own.T), np.kron(states, shadow.T), None, None),
             equations(np.kron(states, bd.T), None, None, None),
-            equations(np.kron(c, e.T), None, -np.kron(outputs, (left @ own).T), np.kron(outputs, shadow.T)),
-            equations(None, None, np.kron(outputs, (left @ bd).T), None),
+            equations(np.kron(c, e.T), None, -np.kron(outputs, (left_kernel @ own).T), np.kron(outputs, shadow.T)),
+            equations(None, None, np.kron(outputs, (left_kernel @ bd).T), None),
         ]
     )
     products = ((-b, dd_past), (b, plant.Dd), (-d, dd_past), (d, plant.Dd))
@@ -240,7 +240,7 @@ def _followed(
         part.reshape(shape)
         for part, shape in zip(
             np.split(solution, np.cumsum(sizes)[:-1]),
-            ((nz, na), (nz, count), (rows, len(left)), (rows, count)),
+            ((nz, na), (nz, count), (rows, len(left_kernel)), (rows, count)),
             strict=True,
         )
     )
@@ -254,7 +254,7 @@ def _followed(
         np.hstack([c, c_past]),
         d,
         np.vstack([t, copies]),
-        s @ left,
+        s @ left_kernel,
         lag,
     )
     return follower, share

@@ -172,17 +172,17 @@ class _Scaled:
         rows = 1.0 / _powers(np.max(largest[nd:] * states, axis=1, initial=0.0))
         sizes = np.max((np.max(np.abs(C), axis=0) + beside[1]) * states, axis=1, initial=0.0)
         outputs = 1.0 / _powers(sizes)
-        left = np.concatenate([time / states[:nd], rows])[:, None]
+        row_units = np.concatenate([time / states[:nd], rows])[:, None]
         errors = ErrorPolytope(
-            [left * a * states for a in A],
+            [row_units * a * states for a in A],
             [outputs[:, None] * c * states for c in C],
-            B=left * B / noisy,
+            B=row_units * B / noisy,
             D=outputs[:, None] * D / noisy,
             Cz=Cz * states,
             dt=0.0,
             differential=nd if nd < len(states) else None,
         )
-        sloped = SlopedErrors(errors, left * W * half, outputs[:, None] * Wy * half, V * states)
+        sloped = SlopedErrors(errors, row_units * W * half, outputs[:, None] * Wy * half, V * states)
         return cls(errors if few else sloped, states, rows, outputs, time, nd)
 
     def solved(self, asked: RegionObserverMethod, given: FloatArray | None, solver: str) -> _Solution:
