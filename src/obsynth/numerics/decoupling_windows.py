@@ -142,6 +142,8 @@ def estimation_problem(
     window = _decoupling_window(a, c, hidden, (bw, dw), selection, lags, plant.dt, form.shift)
     core = _core(a, (bw, dw), window, len(c))
     if reference is not None:
+        # Where all inputs are taken later, the faults of now are those of some samples before.
+        reference = reference if exact else _late(reference, form.shift)
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
         core = _with_reference(core, reference, form.alpha if plant.dt == 0.0 else None, None if exact else newest)
     core = _without_unseen(core, modelled=plant.dt == 0.0 or reference is not None)
@@ -182,6 +184,16 @@ def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int
         if lags[i] == longest:  # the input does nothing at all
             lags[i], direct[:, i], delayed_b[:, i] = 0, 0.0, 0.0
     return lags, (a, delayed_b, c, direct)
+
+
+def _late(model: Model, samples: int) -> Model:
+    """Return a model behind so many samples of delay of all its inputs."""
+    a, b, c, d = model
+    for _ in range(samples):
+        count = b.shape[1]
+        a, b = np.block([[a, b], [np.zeros((count, len(a) + count))]]), np.eye(len(a) + count, count, k=-len(a))
+        c, d = np.hstack([c, d]), np.zeros_like(d)
+    return a, b, c, d
 
 
 def stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:

@@ -8,7 +8,8 @@ linear or not, estimates 0, so that its gain is at least the energy ratio of wha
     \\text{ or } v\\, e^{s t}, \\quad t \\le 0,
 
 for some points s outside the unit circle (right of the axis), h the faults and unknown inputs that the error must not
-show; in discrete time some last samples follow one by one.  The points alone are the witness: each v is enclosed by a
+show; in discrete time some last samples follow one by one, and of index 2 or more some
+after now, on which the states of now depend.  The points alone are the witness: each v is enclosed by a
 linear solution in ball arithmetic, where s must be a zero by an interval Newton step (Rump 2010, section 13), and the
 ratio of one combination is rounded down.  Source: ours.
 """
@@ -23,10 +24,10 @@ import flint
 import numpy as np
 import scipy.linalg
 
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.verification.worst_invisible import Directions, Kernel, Model, Shown, kernel, worst_directions
+from obsynth.verification.worst_invisible import Directions, Kernel, Model, Shown, Through, kernel, worst_directions
 
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
 PRECISION_BITS = (256, 768)
@@ -119,7 +120,7 @@ def proved_least(
     enough : float, optional
         A bound that is enough, by default the level: a combination in double precision that reaches it is taken.
     """
-    if plant.is_discrete and (samples < max(setting.longest, 1) or not has_index_one(plant)):
+    if plant.is_discrete and samples < max(setting.longest, 1):
         return None
     if not all(_grows(flint.acb(point), plant) for point in points):
         return None
@@ -176,7 +177,8 @@ def _directions(
         rest = kernel(system, *_pivots(system))
         first = 0 if setting.exact else nh
         inputs, free = [np.asarray(rest.columns[place])[first:] for place in places], np.asarray(rest.free)
-    return worst_directions(kernels, (inputs, free), shown, setting.models, setting.delays, discrete=plant.is_discrete)
+    through = Through(setting.models, setting.delays, samples)
+    return worst_directions(kernels, (inputs, free), shown, through, discrete=plant.is_discrete)
 
 
 def _pencil(plant: DescriptorSystem, inputs: FloatArray, through: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -209,9 +211,25 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
 
 def has_index_one(plant: DescriptorSystem) -> bool:
     """Whether every trajectory can be continued after now without inputs: ``rank [E A; 0 E] = n + rank E``."""
-    nothing = np.zeros_like(plant.E)
-    pencil = np.block([[plant.E, plant.A], [nothing, plant.E]])
-    return decide_rank(pencil).rank == plant.nx + decide_rank(plant.E).rank
+    return samples_after(plant) == 0
+
+
+@remembered
+def samples_after(plant: DescriptorSystem) -> int:
+    """Return for how many samples after now the equations are to hold, so that a trajectory can be continued.
+
+    None for index 1.  Beyond, states depend on inputs of some samples later: where the equations hold for as many
+    samples as the index, the states up to now are those of a whole trajectory without inputs after these.  The index
+    is the first k for which ``[E A; E A; .. E]`` with k + 1 rows has a rank of n more than with k.
+    """
+    n = plant.nx
+    ranks = [decide_rank(plant.E).rank]
+    for index in range(1, n + 1):
+        pencil = np.kron(np.eye(index + 1), plant.E) + np.kron(np.eye(index + 1, k=1), plant.A)
+        ranks.append(decide_rank(pencil).rank)
+        if ranks[-1] == n + ranks[-2]:
+            return index if index > 1 else 0
+    return n
 
 
 def _grows(point: Any, plant: DescriptorSystem) -> bool:
@@ -480,25 +498,29 @@ def _system_from_rest(
     noise: tuple[FloatArray, FloatArray],
     samples: int,
 ) -> tuple[FloatArray, list[range]]:
-    """Return the equations of last samples from rest with y = 0, and where the inputs of each are in the unknowns."""
+    """Return the equations of last samples from rest with y = 0, and where the inputs of each are in the unknowns.
+
+    Those after now follow, of whose outputs nothing is required.
+    """
     nx, ny = plant.nx, plant.ny
     (bh, dh), (bw, dw) = hidden, noise
     inputs, through = np.hstack([bh, bw]), np.hstack([dh, dw])
     count = inputs.shape[1]
     # States that no derivative or next sample holds may be anything at the start.
     loose = [i for i in range(nx) if not plant.E[:, i].any()]
-    block = count + nx
-    system = np.zeros((samples * (nx + ny), len(loose) + samples * block))
+    block, every = count + nx, samples + samples_after(plant)
+    system = np.zeros((every * (nx + ny), len(loose) + every * block))
     places = []
-    for j in range(samples):
+    for j in range(every):
         row, own = j * (nx + ny), len(loose) + j * block
         states, outputs = slice(row, row + nx), slice(row + nx, row + nx + ny)
         before = slice(own - nx, own) if j else slice(0, len(loose))
-        system[states, before], system[outputs, before] = (
-            (-plant.A, plant.C) if j else (-plant.A[:, loose], plant.C[:, loose])
-        )
-        system[states, own : own + count], system[outputs, own : own + count] = -inputs, through
+        system[states, before] = -plant.A if j else -plant.A[:, loose]
+        system[states, own : own + count] = -inputs
         system[states, own + count : own + block] = plant.E
+        if j < samples:
+            system[outputs, before] = plant.C if j else plant.C[:, loose]
+            system[outputs, own : own + count] = through
         places.append(range(own, own + count))
     return system[system.any(axis=1)], places
 

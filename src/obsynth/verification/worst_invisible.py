@@ -46,6 +46,15 @@ class Shown(NamedTuple):
     noise: slice
 
 
+class Through(NamedTuple):
+    """Models that the faults pass, one after the other, delays of each fault (none with models), and the last samples
+    up to now: those that follow show no output."""
+
+    models: Sequence[Model]
+    delays: Sequence[int]
+    samples: int
+
+
 def kernel(matrix: Array, pivots: Sequence[int], others: Sequence[int]) -> Kernel:
     """Return an orthonormal basis of the kernel of a matrix, and its entries at the places ``others``.
 
@@ -72,8 +81,7 @@ def worst_directions(
     kernels: Mapping[complex, Kernel],
     rest: tuple[Sequence[FloatArray], FloatArray],
     shown: Shown,
-    models: Sequence[Model],
-    delays: Sequence[int],
+    through: Through,
     *,
     discrete: bool,
 ) -> Directions | None:
@@ -87,10 +95,8 @@ def worst_directions(
         Inputs of each of the last samples that start from rest, as columns, and the free entries of those columns.
     shown : Shown
         Rows of faults and noise in the signals; in the last samples they are the first and the last ones.
-    models : sequence of models
-        What the faults pass, one after the other.
-    delays : sequence of int
-        Of each fault, in samples; none with models.
+    through : Through
+        What the faults pass to the error, and until when.
     discrete : bool
         Whether signals are ``s^t`` or ``e^{s t}``.
     """
@@ -100,7 +106,7 @@ def worst_directions(
     both = np.concatenate([points, points.conj()])
     faults, noise = (np.hstack([part, part.conj()]) for part in (signals[shown.faults], signals[shown.noise]))
     error, states = faults, []
-    for a, b, c, d in models:
+    for a, b, c, d in through.models:
         inner = _states(a, b @ error, both)
         states.append(inner)
         error = c @ inner + d @ error
@@ -108,7 +114,7 @@ def worst_directions(
     energies = [(part.conj().T @ part) / inner_weights for part in (error, noise)]
     inputs, free = rest
     if inputs:
-        tails = _last_samples((faults, noise), both, inputs, (models, states), delays)
+        tails = _last_samples((faults, noise), both, inputs, through, states)
         late = free.shape[1]
         energies = [np.pad(part, (0, late)) for part in energies]
         energies = [part + tail.conj().T @ tail for part, tail in zip(energies, tails, strict=True)]
@@ -136,8 +142,8 @@ def _last_samples(
     members: tuple[ComplexArray, ComplexArray],
     points: ComplexArray,
     inputs: Sequence[FloatArray],
-    through: tuple[Sequence[Model], Sequence[ComplexArray]],
-    delays: Sequence[int],
+    through: Through,
+    states: Sequence[ComplexArray],
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return error and noise in the last samples, one under the other: members go on, others start from rest."""
     faults, noise = members
@@ -145,14 +151,14 @@ def _last_samples(
     nf, nw = len(faults), len(noise)
     outputs = [np.hstack([faults * power, part[:nf]]) for power, part in zip(powers, inputs, strict=True)]
     noises = [np.hstack([noise * power, part[len(part) - nw :]]) for power, part in zip(powers, inputs, strict=True)]
-    for (a, b, c, d), inner in zip(*through, strict=True):
+    for (a, b, c, d), inner in zip(through.models, states, strict=True):
         state, passed = np.pad(inner, ((0, 0), (0, inputs[0].shape[1]))), []
         for sample in outputs:
             passed.append(c @ state + d @ sample)
             state = a @ state + b @ sample
         outputs = passed
-    late = np.array(delays or (0,) * len(outputs[0]))
-    outputs = [part[k + late < len(inputs)] for k, part in enumerate(outputs)]
+    late = np.array(through.delays or (0,) * len(outputs[0]))
+    outputs = [part[k + late < through.samples] for k, part in enumerate(outputs)]
     return np.vstack(outputs), np.vstack(noises)
 
 

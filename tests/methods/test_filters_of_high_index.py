@@ -1,0 +1,59 @@
+"""Optimal filters of sampled plants of index 2 or more, whose outputs show inputs of later samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+import obsynth
+from obsynth.verification.invisible_faults import Setting, proved_least, seen_plant
+
+#: y1 = f_k + w_{k+1} and y2 = w_k + n_k: with one sample of delay w is measured, with noise.
+LATER_NOISE = obsynth.DescriptorSystem(
+    E=[[0, 1], [0, 0]],
+    A=np.eye(2),
+    C=np.eye(2),
+    Bf=np.zeros((2, 1)),
+    Df=[[1], [0]],
+    Bw=[[0, 0], [-1, 0]],
+    Dw=[[0, 0], [0, 1]],
+    dt=1.0,
+)
+
+
+def scrambled(seed: int, index: int) -> obsynth.DescriptorSystem:
+    """Return a plant of an index in random integer coordinates."""
+    rng = np.random.default_rng([index, seed])
+    modes = np.round(2.0 * rng.standard_normal((2, 2))) / 4.0
+    e, a = block_diag(np.eye(2), np.eye(index, k=1)), block_diag(modes, np.eye(index))
+    left, right = (np.eye(len(e)) + np.triu(rng.integers(-1, 2, a.shape), 1) for _ in range(2))
+    c, bf = rng.integers(-2, 3, (2, len(e))), rng.integers(-2, 3, (len(e), 1))
+    return obsynth.DescriptorSystem(
+        E=left @ e @ right, A=left @ a @ right, C=c, Bf=bf, dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1}
+    )
+
+
+@pytest.mark.parametrize(("delay", "truth"), [(0, 1.0), (1, 0.5**0.5)])
+def test_noise_that_is_seen_a_sample_before_has_its_least_gain_proved(delay: int, truth: float) -> None:
+    plant, setting = seen_plant(LATER_NOISE, ()), Setting((delay,), (), True)
+    bounds = [
+        proved_least(plant, points, 3, setting, level=truth, enough=0.0)
+        for points in ([], [1.5 + 0j], [1.1j, -2.0 + 0j])
+    ]
+    assert all(bound is not None and truth * (1 - 1e-9) < bound <= truth * (1 + 1e-14) for bound in bounds)
+
+
+def test_a_filter_reaches_the_least_gain_with_noise_of_the_next_sample() -> None:
+    design = obsynth.optimal_filter(LATER_NOISE, delay=1)
+    assert design.report.passed
+    assert design.gain == pytest.approx(0.5**0.5, rel=1e-6)
+    assert design.least == pytest.approx(0.5**0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("index", [2, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.long)])
+def test_gain_and_least_gain_meet_whatever_the_index(index: int, seed: int) -> None:
+    design = obsynth.optimal_filter(scrambled(seed, index))
+    assert design.report.passed
+    assert 0.0 < design.least <= design.gain < design.least * (1 + 1e-6)
