@@ -204,6 +204,7 @@ def _designed(
     with failed_computations(), one_thread_if_small(plant.nx):
         working = working_plant(plant, recovery, progress, method)
         plant, recovery, notes = working.plant, working.recovery, working.notes
+        method = working.method or method
         try:
             synthesis = method.synthesise(plant, progress=progress, **more)
         except PreconditionError as error:

@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.method import Method
+from obsynth.methods.options_as_written import method_for_proper_form
 from obsynth.methods.registry import Plant
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -40,6 +41,7 @@ class WorkingPlant:
     notes: tuple[str, ...] = ()
     reduced: str = ""
     dropped: tuple[str, ...] = ()
+    method: Method | None = None  # with its options for this plant; ``None`` where they are the same
 
     def sensors(self) -> tuple[Sensor, ...] | None:
         """Return a sensor for each state as written that a reduced plant still has; ``None`` where it was not
@@ -71,12 +73,16 @@ def working_plant(
             return WorkingPlant(plant, recovery)
         progress("reducing the index")
         notes = (f"{_reason(plant)}: {transformation.description}.", *notes)
+        if method is not None:
+            method, more = method_for_proper_form(plant, transformation, method)
+            notes = (*notes, *more)
         return WorkingPlant(
             transformation.plant,
             _composed_recovery(recovery, transformation),
             notes,
             " ".join(notes),
             transformation.dropped,
+            method,
         )
     if not plant.is_sparse:
         return WorkingPlant(plant, recovery)

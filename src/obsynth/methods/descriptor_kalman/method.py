@@ -38,7 +38,9 @@ class DescriptorKalman(Method):
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity
-        (in natural units where the plant's are far from these).
+        (in natural units where the plant's are far from these).  Of a plant of index 2 or more, which is reduced, a
+        constant one of the equations as written is carried to the free states (it is refused where noise in a
+        constraint would be needed at another time), as are ``initial_state`` and ``initial_covariance``.
     R : MatrixLike, optional
         Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
     initial_state : array_like, optional
