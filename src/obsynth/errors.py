@@ -53,6 +53,12 @@ class ObsynthError(Exception):
     ----------
     exit_code : int
         Exit code of the command line when this error ends it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> issubclass(obsynth.SpecError, obsynth.ObsynthError), obsynth.SpecError.exit_code
+    (True, 2)
     """
 
     exit_code = 1
@@ -80,6 +86,15 @@ class SpecError(ObsynthError):
         All problems found, when there are several; they are appended to the message.
     code : str, optional
         Short name of the problem that stays the same, for programs; empty if it has none.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> try:
+    ...     obsynth.DescriptorSystem(A=[[1, 2]], C=[[1, 0]], dt=1.0)
+    ... except obsynth.SpecError as error:
+    ...     print(error.path, error.exit_code)
+    A 2
     """
 
     exit_code = 2
@@ -111,6 +126,18 @@ class PreconditionError(ObsynthError):
         Sets of states, the measurement of any one of which would make the design possible.
     unclear : bool, optional
         Whether double precision cannot decide the condition.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> try:
+    ...     obsynth.pd_observer(plant)
+    ... except obsynth.PreconditionError as error:
+    ...     print(error.condition)
+    continuous time
     """
 
     exit_code = 3

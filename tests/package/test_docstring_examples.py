@@ -1,4 +1,5 @@
-"""The examples in the docstrings of everything public: each function has one, and each prints what it says."""
+"""The examples in the docstrings of everything public: each function has one, most results have one, and each prints
+what it says."""
 
 from __future__ import annotations
 
@@ -9,17 +10,32 @@ from pathlib import Path
 import pytest
 
 import obsynth
+import obsynth.types
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = {f"obsynth.{name}": getattr(obsynth, name) for name in obsynth.__all__}
 PUBLIC |= {f"obsynth.conditions.{name}": getattr(obsynth.conditions, name) for name in obsynth.conditions.__all__}
 PUBLIC |= {f"obsynth.plotting.{name}": getattr(obsynth.plotting, name) for name in obsynth.plotting.__all__}
+PUBLIC |= {f"obsynth.types.{name}": getattr(obsynth.types, name) for name in obsynth.types.__all__}
 FUNCTIONS = {name: item for name, item in PUBLIC.items() if inspect.isfunction(item)}
 WITH_EXAMPLES = {name: item for name, item in PUBLIC.items() if ">>>" in (inspect.getdoc(item) or "")}
 
 
+#: Results whose example would take as long as what makes them, which has one: seconds of calibration, of windows over a
+#: region, of learning from a log.
+WITHOUT_EXAMPLES = {
+    *("CalibratedBox", "Calibration", "LearnedThresholds", "RegionObserver", "RegionTradeOff", "ScheduledObserver"),
+    *("ToleranceStudy", "WindowObserver"),
+}
+
+
 def test_every_public_function_has_an_example() -> None:
     assert sorted(set(FUNCTIONS) - set(WITH_EXAMPLES)) == []
+
+
+def test_every_result_has_an_example_where_it_is_made_fast() -> None:
+    without = set(obsynth.types.__all__) - {name.removeprefix("obsynth.types.") for name in WITH_EXAMPLES}
+    assert without == WITHOUT_EXAMPLES
 
 
 @pytest.mark.parametrize("name", sorted(WITH_EXAMPLES))

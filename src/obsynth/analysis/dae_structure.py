@@ -50,6 +50,22 @@ class Identifiability:
         Least eigenvalue of the information on the parameters alone (the initial state known), in units of `scales`.
     rank : int
         Number of directions that are seen.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * sqrt(level)"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m/s", "c": "m0.5/s", "gauge": "m"},
+    ... )
+    >>> result = obsynth.identifiability(tank, np.full((50, 1), 0.5), dt=1.0, R=1e-4)
+    >>> result.names, result.rank
+    (('level', 'c'), 2)
     """
 
     names: tuple[str, ...]

@@ -50,6 +50,14 @@ class FaultFigures:
         Standard deviation under the stated noise.
     unknown_input_gain : float
         Largest gain of a held sinusoidal unknown input to the estimate, per unit of the input.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    >>> figures = obsynth.compare(plant, methods=["functional-filter"], runs=2).methods[0].faults[0].figures
+    >>> figures.fault, figures.half <= figures.most
+    ('f1', True)
     """
 
     fault: str

@@ -24,6 +24,23 @@ class Detection:
     fault : str
         The isolated fault: largest estimate at (or a given number of samples after) the alarm, in its own deviations;
         of guaranteed tests the one that is there, or "one or another"; empty without an alarm.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> monitor = obsynth.monitor(design, scenario)
+    >>> detection = monitor.watch(obsynth.simulate(design, scenario).estimates)
+    >>> detection.fault, detection.k, detection.time
+    ('f1', 11, 11.0)
     """
 
     kind: str
@@ -52,6 +69,19 @@ class Alarm:
         minus what was asked).
     value : float
         The statistic there.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None, A=[[0.9]], C=[[1.0]], Phi=[[1.0]], dt=1.0, horizon=50, parameter_names=["leak"]
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> scenario = obsynth.Scenario(horizon=49, faults={"leak": obsynth.Step(size=0.5, start=20)}, noise=1.0)
+    >>> estimates = obsynth.simulate(design, scenario).estimates
+    >>> alarm = obsynth.decide(design.observer, estimates, nominal=[0.0], false_alarms=0.01).alarm
+    >>> alarm.parameter, 20 <= alarm.k <= 30, alarm.confidence >= 0.99
+    ('leak', True, True)
     """
 
     k: int
@@ -75,6 +105,19 @@ class Decision:
         ``(samples,)``; they differ where samples are missing.
     alarm : Alarm or None
         The first one.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None, A=[[0.9]], C=[[1.0]], Phi=[[1.0]], dt=1.0, horizon=50, parameter_names=["leak"]
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> scenario = obsynth.Scenario(horizon=49, faults={"leak": obsynth.Step(size=0.5, start=20)}, noise=1.0)
+    >>> estimates = obsynth.simulate(design, scenario).estimates
+    >>> decision = obsynth.decide(design.observer, estimates, nominal=[0.0], false_alarms=0.01)
+    >>> decision.values.shape, decision.alarm.parameter
+    ((50,), 'leak')
     """
 
     statistic: str

@@ -78,6 +78,17 @@ class Estimates:
         ``(nx,)``, nonlinear observers: how far the initial state was moved onto its constraint.
     received : numpy.ndarray
         ``(samples, ny)``, of bool: which outputs were there; recursive and nonlinear observers.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> run = obsynth.simulate(design, obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0)}))
+    >>> run.estimates.fault_names, run.estimates.faults.shape
+    (('f1',), (31, 1))
     """
 
     states: FloatArray

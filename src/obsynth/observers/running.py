@@ -188,6 +188,17 @@ class RunningObserver(Generic[State, Row]):
         What runs.
     state : NamedTuple, optional
         Where to begin; ``observer.init()`` by default.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> running = obsynth.types.RunningObserver(design.observer)
+    >>> running.step([0.0, 0.0]).faults.tolist()
+    [[0.0]]
     """
 
     def __init__(self, observer: Observer[State, Row], state: State | None = None) -> None:

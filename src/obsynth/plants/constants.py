@@ -69,6 +69,16 @@ class Constant:
         Ends of its range, around the nominal value; equal to it where the constant is known.
     unit : str, optional
         Of all three.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
+    ... )
+    >>> constant = plant.uncertainty.box.constants["a"]
+    >>> constant.nominal, constant.low, constant.high
+    (0.5, 0.475, 0.525)
     """
 
     name: str
@@ -141,6 +151,16 @@ class ConstantsBox:
         For ``calibrated``: the constants that the log has bounded, where the ranges of others are stated; all if empty.
     calibration : str, optional
         For ``calibrated``: sha256 of the calibration file that gives the box.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
+    ... )
+    >>> box = plant.uncertainty.box
+    >>> box.names, box.variation, box.source
+    (('a',), 'constant', 'stated')
     """
 
     constants: Mapping[str, Constant]

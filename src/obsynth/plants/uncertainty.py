@@ -56,6 +56,15 @@ class Uncertainty:
         moves with the constants; empty where it does not move, None for a plant that is linear.
     lost : str, optional
         What was done to the plant that its tolerances could not follow: bounds over the box are refused then.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
+    ... )
+    >>> dict(plant.uncertainty.entries), plant.uncertainty.box.names
+    ({'A': ((0, 0, 'a'),)}, ('a',))
     """
 
     box: ConstantsBox

@@ -52,6 +52,17 @@ class Check:
         Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
     unclear : bool, optional
         Of a condition that does not hold: whether double precision could not decide it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> check = design.report.checks[0]
+    >>> check.name, check.passed, check.status
+    ('plant: regular', True, 'recomputed')
     """
 
     name: str

@@ -52,6 +52,16 @@ class Certificate:
         Witnesses of existence statements, such as the Lyapunov matrix of a matrix inequality.
     claims : mapping of str to float
         Numbers that are claimed, such as an l2 gain.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> sorted(design.certificate.claims)
+    ['gamma', 'gamma_min', 'state_lag']
     """
 
     matrices: Mapping[str, FloatArray]
@@ -95,6 +105,16 @@ class ObserverDesign:
         Rows by which inputs of a log act later than this design takes them.  Designs of linear discrete and of
         time-varying plants take the inputs of a row to act during the step that begins there, those of nonlinear plants
         during the step that ends there, continuous ones as straight lines between rows.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> design.method, design.report.passed, design.observer.order
+    ('fault-estimation-filter', True, 2)
     """
 
     name: str

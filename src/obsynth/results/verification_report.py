@@ -18,6 +18,16 @@ class VerificationReport:
     ----------
     checks : tuple of Check
         The rows, in the order of the argument they make.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> design.report.passed, len(design.report.failures)
+    (True, 0)
     """
 
     checks: tuple[Check, ...] = field(default_factory=tuple)

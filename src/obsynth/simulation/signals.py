@@ -240,6 +240,18 @@ class Trajectory:
     inconsistency : float
         Linear plants: norm of the change that the given initial state needed to satisfy the algebraic equations at
         k = 0; only rounding for a consistent one.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> model = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - level"}, {"gauge": "level"},
+    ...     states={"level": 1.0}, inputs={"inflow": 1.0},
+    ... )
+    >>> run = obsynth.simulate_dae(model, np.full((3, 1), 2.0), dt=1.0)
+    >>> run.time.tolist(), run.states[:, 0].round(3).tolist()
+    ([0.0, 1.0, 2.0], [1.0, 1.632, 1.865])
     """
 
     states: FloatArray

@@ -74,6 +74,17 @@ class Simulation:
         not within the record.  Zero where the observer states deviations: they say from the start what it knows.
     notes : tuple of str
         What a reader must know: a feedback that was added, holds between samples, a projected start.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> run = obsynth.simulate(design, obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)}))
+    >>> float(run.time[-1]), run.estimates.faults[-1].round(3).tolist()
+    (30.0, [1.0])
     """
 
     time: FloatArray

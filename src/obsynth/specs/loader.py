@@ -70,6 +70,13 @@ class Spec:
         row) and ``delay`` (rows).
     noise : mapping, optional
         Noise of the sensors, offsets and walks as written, for which the plant has states (`obsynth.with_noise`).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> spec = obsynth.load_spec("designs/wang2015/spec.yaml")
+    >>> spec.name, spec.method, spec.plant.nx
+    ('wang2015', 'fault-estimation-filter', 4)
     """
 
     name: str

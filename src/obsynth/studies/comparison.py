@@ -156,6 +156,15 @@ class FaultComparison:
     equal_delay : float, seconds
         On a log: from the fault to its alarm, with the level that 1 % of the normal rows pass; median over its begins,
         infinite where it is not found.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    >>> comparison = obsynth.compare(plant, methods=["functional-filter"], runs=2)
+    >>> fault = comparison.methods[0].faults[0]
+    >>> fault.figures.fault, fault.rms >= 0.0
+    ('f1', True)
     """
 
     figures: FaultFigures
@@ -197,6 +206,15 @@ class ComparedMethod:
     beside : LeastPossible or None
         Gain from the unknown inputs, and deviation for the noise, with the least of any causal filter that responds to
         the faults as this one does, in the design's own time; ``None`` where that is not known.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    >>> comparison = obsynth.compare(plant, methods=["functional-filter"], runs=2)
+    >>> method = comparison.methods[0]
+    >>> method.method, method.refused, method.order
+    ('functional-filter', '', 2)
     """
 
     method: str
@@ -300,6 +318,14 @@ class Comparison:
         The log by its name and digest, and how its columns were read.
     notes : tuple of str, optional
         What is to be said of the log: cells without numbers, rows that are left out, outputs that are stuck.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    >>> comparison = obsynth.compare(plant, methods=["functional-filter", "optimal-filter"], runs=2)
+    >>> [method.method for method in comparison.methods]
+    ['optimal-filter', 'functional-filter']
     """
 
     methods: tuple[ComparedMethod, ...]

@@ -44,6 +44,22 @@ class Interval:
         Confidence interval; NaN where too few runs count.
     count : int
         Runs that count.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> rates = obsynth.evaluate(design, scenario, runs=10, monitor=obsynth.monitor(design, scenario))
+    >>> rates.false_alarm_rate.low, round(rates.false_alarm_rate.high, 2)  # of no alarm in ten runs
+    (0.0, 0.31)
     """
 
     value: float
@@ -98,6 +114,22 @@ class Evaluation:
     fault_rmse, state_rmse : mapping of str to Interval
         Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
         uncertain they are from the start, over the whole record but its first row.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> rates = obsynth.evaluate(design, scenario, runs=10, monitor=obsynth.monitor(design, scenario))
+    >>> rates.false_alarm_rate.value, rates.detection_delay.value
+    (0.0, 1.0)
     """
 
     runs: int

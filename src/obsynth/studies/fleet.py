@@ -66,6 +66,22 @@ class FleetRun:
         The estimates.
     fault : str
         What the first alarm of a monitor that names a fault points to; empty without one.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> import pandas as pd
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = design.save(f"{folder}/a.gains.json")
+    ...     pd.DataFrame({"time": range(20), "y1": 0.0, "y2": 0.0}).to_csv(f"{folder}/log.csv", index=False)
+    ...     run = obsynth.run_fleet(f"{folder}/a.gains.json", f"{folder}/log.csv", f"{folder}/results").runs[0]
+    >>> run.rows, dict(run.alarms)
+    (20, {})
     """
 
     name: str
@@ -87,6 +103,22 @@ class Fleet(ResultTable):
     ----------
     runs : tuple of FleetRun
         One for each design and log.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> import pandas as pd
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = design.save(f"{folder}/a.gains.json")
+    ...     pd.DataFrame({"time": range(20), "y1": 0.0, "y2": 0.0}).to_csv(f"{folder}/log.csv", index=False)
+    ...     fleet = obsynth.run_fleet(f"{folder}/a.gains.json", f"{folder}/log.csv", f"{folder}/results")
+    >>> len(fleet), fleet.runs[0].status
+    (1, 'run')
     """
 
     runs: tuple[FleetRun, ...]

@@ -44,6 +44,16 @@ class SensorSet:
         noise is not stated, or nothing is estimated.
     threshold, samples, sample_time : float, int, float, optional
         Of goal ``threshold``: the proved threshold of the test with the shortest delay, on so many samples.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0, state_names=["a", "b"]
+    ... )
+    >>> cheapest = obsynth.sensor_sets(plant, goal="estimate-step").sets[0]
+    >>> cheapest.sensors, cheapest.cost
+    (('b',), 1.0)
     """
 
     sensors: tuple[str, ...]
@@ -75,6 +85,16 @@ class SensorSets:
         those that the plant reaches with no sensor added.
     notes : tuple of str
         What was searched; where no set is small enough, one that does it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0, state_names=["a", "b"]
+    ... )
+    >>> additions = obsynth.sensor_sets(plant, goal="estimate-step")
+    >>> additions.sets[0].sensors, additions.exact
+    (('b',), True)
     """
 
     goal: str

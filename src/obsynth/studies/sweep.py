@@ -63,6 +63,16 @@ class SweepResult:
         The gain set, where the sweep has a folder.
     content : bytes or None
         The gain set, where it has none.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> result = obsynth.sweep(plant, {"decay": [0.2]}, method="ui-pi-observer").results[0]
+    >>> result.status, dict(result.parameters)
+    ('designed', {'decay': 0.2})
     """
 
     name: str
@@ -101,6 +111,16 @@ class Sweep(ResultTable):
     ----------
     results : tuple of SweepResult
         One for each case.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> grid = obsynth.sweep(plant, {"decay": [0.2, 0.5]}, method="ui-pi-observer")
+    >>> len(grid.results), grid.counts
+    (2, {'designed': 2})
     """
 
     results: tuple[SweepResult, ...]

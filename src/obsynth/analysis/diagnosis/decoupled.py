@@ -63,6 +63,16 @@ class DecoupledPlant:
         Unit of s in which the plant is balanced, 1/s.
     decisions : tuple of RankDecision
         Every rank decided on the way.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> decoupled = obsynth.decouple(plant)
+    >>> decoupled.order, decoupled.faults, decoupled.without
+    (1, ('f1',), ('d1',))
     """
 
     E: FloatArray

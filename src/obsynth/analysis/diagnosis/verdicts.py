@@ -34,6 +34,16 @@ class StructuredResidual:
         Those of `sees` whose constant values it keeps seeing.
     order : int or None
         Least order of a filter with one residual that sees them all; ``None`` where it is beyond what is computed.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> residual = obsynth.diagnose(plant).bank[0]
+    >>> residual.sees, residual.order
+    (('f1',), 1)
     """
 
     sees: tuple[str, ...]
@@ -115,6 +125,16 @@ class FaultDiagnosis:
     least_step : float or None
         In its unit: the step that stands out by three standard deviations of the sensors' noise in the mean of 100
         samples, whatever the other faults are; ``None`` where no noise is stated on every output.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> fault = obsynth.diagnose(plant).faults[0]
+    >>> fault.name, fault.detectable, fault.estimable
+    ('f1', True, True)
     """
 
     name: str
@@ -176,6 +196,16 @@ class Diagnosis:
     margins : FloatArray
         ``(nf, nf)``, dimensionless: entry (i, j) by how much fault i has to be larger to be distinguished from fault j
         than to be seen; infinite where it cannot be.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> diagnosis = obsynth.diagnose(plant)
+    >>> diagnosis.faults[0].name, diagnosis.faults[0].detectable
+    ('f1', True)
     """
 
     faults: tuple[FaultDiagnosis, ...]

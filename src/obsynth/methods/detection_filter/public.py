@@ -17,6 +17,16 @@ class DetectionFilter(ObserverDesign):
     """The design of a residual filter of least gain from the unknown inputs for what it shows of the faults.
 
     An `ObserverDesign` in every respect; made by `detection_filter`.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[-1.0]], C=[[1.0]], Bf=[[1.0]], Bd=[[0.5]], sensor_noise={"y1": 0.1}
+    ... )
+    >>> design = obsynth.detection_filter(plant)
+    >>> isinstance(design, obsynth.types.DetectionFilter), design.method
+    (True, 'detection-filter')
     """
 
     @property

@@ -92,6 +92,18 @@ class AlarmEvent:
         Whether what is named drifts rather than jumped.
     shelved : float, seconds
         Since when there has been an offset that no fault explains, where it has stood for 200 rows; else NaN.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = {"time": list(range(20)), "y1": [0.0] * 10 + [1.0] * 10, "y2": [0.0] * 20}
+    >>> event = obsynth.run_on_data(design, log, thresholds={"fhat[f1]": 0.5}).events[0]
+    >>> event.by, event.first_row, event.rows
+    ('fhat[f1]', 11, 1)
     """
 
     by: str

@@ -62,6 +62,19 @@ class AlarmProof:
         Where the bounds of the state come from.
     certificate : mapping
         Everything that `obsynth verify` needs; empty without a proof.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import pandas as pd
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = pd.DataFrame({"time": range(4), "u1": 0.0, "y1": [0.0, 0.0, 0.0, 1.0]})
+    >>> proof = obsynth.prove_alarm(design, log, 4, initial_set={"x1": 0.1})
+    >>> proof.proved, proof.row
+    (True, 4)
     """
 
     proved: bool

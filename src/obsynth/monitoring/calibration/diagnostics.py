@@ -223,6 +223,19 @@ class Validation:
         ``(n, 2)``: each estimated parameter with its standard deviation.
     log : mapping
         ``source``, ``rows``, ``digest``, ``samples`` and ``dt``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import pandas as pd
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None, A=[[0.9]], C=[[1.0]], Phi=[[1.0]], dt=1.0, horizon=50, parameter_names=["leak"]
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=49, noise=1.0)).outputs
+    >>> validation = obsynth.validate(design, pd.DataFrame({"time": range(len(log)), "y1": log[:, 0]}))
+    >>> validation.passed, validation.change
+    (True, None)
     """
 
     passed: bool

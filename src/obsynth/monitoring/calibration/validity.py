@@ -54,6 +54,24 @@ class Validity:
         The standard deviations that were used.
     time : FloatArray
         ``(n,)`` seconds.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * sqrt(level)"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m/s", "c": "m0.5/s", "gauge": "m"},
+    ... )
+    >>> linear = obsynth.linearise(tank, given={"inflow": 0.5})
+    >>> log = {"time": np.arange(20), "inflow": 0.5 + 0.1 * (np.arange(20) > 5), "gauge": np.ones(20)}
+    >>> region = obsynth.validity(tank, linear, log, deviations={"gauge": 0.01})
+    >>> round(region.largest, 2), round(region.excursion["gauge"], 3)
+    (3.0, 0.418)
     """
 
     largest: float

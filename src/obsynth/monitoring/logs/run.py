@@ -86,6 +86,18 @@ class DataRun:
         What the threshold of its monitor promises, and what that rests on; empty without one.
     stuck : mapping of str to tuple of (int, int)
         First and last rows, from 1, in which an output repeats one value for longer than it otherwise does.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = {"time": list(range(20)), "y1": [0.0] * 10 + [1.0] * 10, "y2": [0.0] * 20}
+    >>> run = obsynth.run_on_data(design, log, thresholds={"fhat[f1]": 0.5})
+    >>> run.rows, run.alarms, run.alarm_rows
+    (20, {'fhat[f1]': 10.0}, {'fhat[f1]': 11})
     """
 
     rows: int

@@ -217,6 +217,17 @@ class Monitor:
         Whether the fault estimates stand in place of the residual, which does not see modelled faults.
     groups : tuple of tuple of str, optional
         By row that is watched: an alarm of it proves that one of these faults is there.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> monitor = obsynth.online_monitor(design, disturbance_bounds={"d1": 0.1}, initial_error=0.0)
+    >>> monitor.kind
+    'pointwise'
     """
 
     kind: str

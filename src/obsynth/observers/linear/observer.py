@@ -54,6 +54,18 @@ class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     ------
     SpecError
         Shapes do not fit together, names are no tuple of unique texts, or delays no tuple of whole numbers.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> observer = design.observer
+    >>> state, estimates = observer.step(observer.init(), [0.0, 0.0])
+    >>> estimates.faults.tolist()
+    [[0.0]]
     """
 
     Az: FloatArray

@@ -56,6 +56,17 @@ class RecursiveObserver(RecursiveSettings):
     ------
     SpecError
         A shape does not fit the plant.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None, A=[[0.9]], C=[[1.0]], Phi=[[1.0]], dt=1.0, horizon=50, parameter_names=["leak"]
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> state, estimates = design.observer.step(design.observer.init(), [0.1])
+    >>> estimates.fault_names
+    ('leak',)
     """
 
     @cached_property

@@ -55,6 +55,14 @@ class SteadyState:
         ``(nx, ne)`` and ``(nx, ny)``: the gains (11).
     rate : float
         Factor per step by which the distance of P to its limit shrinks: the squared spectral radius of L A.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0)
+    >>> steady = obsynth.steady_state_filter(plant, Q=1.0, R=1.0)
+    >>> steady.K.round(4).tolist(), round(steady.rate, 4)
+    ([[0.5311]], 0.055)
     """
 
     P: FloatArray
