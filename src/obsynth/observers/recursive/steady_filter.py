@@ -37,6 +37,9 @@ from obsynth.plants.transformations.recovery import Transformation
 #: The solution must satisfy its equation to this share of its size: half the digits.
 RICCATI_TOLERANCE = 1e-8
 
+#: A deviation below so many roundings of the noise that a gain passes on is zero: what is exact came out below three.
+ROUNDED_TERMS = 64.0
+
 #: Newton steps after the recursion: each doubles the digits.
 MOST_RICCATI_STEPS = 50
 
@@ -109,7 +112,7 @@ def steady_state_filter(
     -----
     (16) needs Q and R definite.  Where they are singular (equations or outputs that hold exactly) or ill-conditioned,
     the fixed point of the filter's own step is found by Newton's method (Kleinman), from gains that the recursion has
-    made stable.
+    made stable.  States that sensors and equations without noise tell exactly have a covariance of zero.
 
     References
     ----------
@@ -141,11 +144,13 @@ def steady_state_filter(
     noise = stacked_noise(*roots)
     P = _from_riccati(E, A, C, q, r) if decide_rank(q).full and decide_rank(r).full else None
     step = _Step(E, A, C, noise)
-    if P is None or not _is_fixed(P, step.taken(P)[1]):
+    if P is None or not step.stays_at(P):
         P = _from_recursion(step)
-    _, following = step.taken(P)
+    if not step.stays_at(P):
+        known = step.without_rounding(P)
+        P = known if step.stays_at(known, rounded=True) and step.is_stable(step.settled_gain(known)) else P
     gain = step.settled_gain(P)
-    if not _is_fixed(P, following):
+    if not step.stays_at(P, rounded=True):
         raise SolverError("The solution of the Riccati equation (16) fails its own residual. Run the filter instead.")
     L, K = gain[:, : varying.ne], gain[:, varying.ne :]
     return SteadyState(
@@ -213,10 +218,6 @@ def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_
     )
 
 
-def _is_fixed(P: FloatArray, following: FloatArray) -> bool:
-    return bool(np.linalg.norm(following - P) <= RICCATI_TOLERANCE * np.linalg.norm(P))
-
-
 def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray | None:
     """Solve (16) for the inverse of P; return ``None`` where the solver finds nothing."""
 
@@ -225,18 +226,20 @@ def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r:
     information = E.T @ weighted[:, :n] + C.T @ np.linalg.solve(r, C)
     cross, square = E.T @ weighted[:, n:], A.T @ weighted[:, n:]
     try:
-        inverse = discrete_riccati(
-            np.zeros((n, n)),
-            np.eye(n),
-            0.5 * (information + information.T),
-            0.5 * (square + square.T),
-            e=np.eye(n),
-            s=cross,
-        )
+        # What a badly conditioned equation gives is judged by its residual.
+        with warnings.catch_warnings(action="ignore"):
+            inverse = discrete_riccati(
+                np.zeros((n, n)),
+                np.eye(n),
+                0.5 * (information + information.T),
+                0.5 * (square + square.T),
+                e=np.eye(n),
+                s=cross,
+            )
         P = np.linalg.inv(inverse)
     except (np.linalg.LinAlgError, ValueError):  # SciPy raises ValueError where it cannot reorder the Schur form
         return None
-    return np.asarray(0.5 * (P + P.T), dtype=np.float64)
+    return np.asarray(0.5 * (P + P.T), dtype=np.float64) if np.all(np.isfinite(P)) else None
 
 
 def _from_recursion(step: _Step) -> FloatArray:
@@ -245,7 +248,7 @@ def _from_recursion(step: _Step) -> FloatArray:
     P, A = np.eye(step.A.shape[1]), step.A
     gain, following = step.taken(P)
     for _ in range(MOST_SETTLING_STEPS):
-        if spectral_radius(gain[:, : len(A)] @ A) < 1.0:
+        if step.is_stable(gain):
             break
         P = following
         gain, following = step.taken(P)
@@ -284,6 +287,30 @@ class _Step:
         solved = solved or rank_revealing_step(H, S, data, unknown, mapped=len(H), rounding=rounding)
         self.rounding = solved.rounding if len(solved.rounding) else self.rounding
         return solved.estimate, np.asarray(solved.factor @ solved.factor.T)
+
+    def is_stable(self, gain: FloatArray) -> bool:
+        """Return whether errors decay with a gain ``[L K]``."""
+        return spectral_radius(gain[:, : len(self.A)] @ self.A) < 1.0
+
+    def stays_at(self, P: FloatArray, *, rounded: bool = False) -> bool:
+        """Return whether a step from P comes back to it, up to digits of P, or of noise that cancels (``rounded``)."""
+        gain, following = self.taken(P)
+        allowed = RICCATI_TOLERANCE * np.linalg.norm(P)
+        if rounded:
+            allowed += np.sum(self._rounding_deviations(gain) ** 2)
+        return bool(np.linalg.norm(following - P) <= allowed)
+
+    def without_rounding(self, P: FloatArray) -> FloatArray:
+        """Return P with zeros for states that are known exactly, of which rounding makes the noise that cancels."""
+        gain, _ = self.taken(P)
+        known = np.sqrt(np.maximum(np.diag(P), 0.0)) <= self._rounding_deviations(gain)
+        return np.where(known[:, None] | known, 0.0, P)
+
+    def _rounding_deviations(self, gain: FloatArray) -> FloatArray:
+        """Return the deviation ``(nx,)`` that rounding gives each state: of noise that a gain passes on, or that would
+        pass by least squares, of which a gain is what is best."""
+        sizes = np.linalg.norm((np.abs(gain) + np.abs(np.linalg.pinv(self.matrices.H))) @ np.abs(self.noise), axis=1)
+        return np.asarray(ROUNDED_TERMS * float(np.finfo(np.float64).eps) * sizes)
 
     def settled_gain(self, P: FloatArray) -> FloatArray:
         """Return ``[L K]`` at P: of one step, or where outputs without noise leave it to rounding, after many."""
