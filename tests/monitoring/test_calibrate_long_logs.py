@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from obsynth import DAEModel, PreconditionError, calibrate
+from obsynth.monitoring.calibration import step_graphs
 from obsynth.monitoring.calibration.logs import read_log
 from obsynth.monitoring.calibration.long_logs import SEARCHED_ROWS, searched_rows
 from obsynth.monitoring.calibration.maximum import Maximum, avoided_variances, descent, without_collapse
+from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.simulation_error import _runs_away
 
 TANK = DAEModel(
@@ -121,3 +124,29 @@ def test_a_variance_that_is_kept_from_zero_is_sought_where_fewer_rows_have_it() 
         assert avoided_variances(objective, found.z) == pytest.approx(found.z)
         places.append(objective.starts)
     assert places == [[0.0, 3.0, -3.0], [-0.5], [0.0, 3.0, -3.0]]
+
+
+def test_what_leads_to_another_fit_has_no_box_and_what_is_not_evaluated_is_not_compiled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Boxes and compilers took as long as the searches themselves, for models that were left at once."""
+    log = tank_log(80)
+    log["gauge"][50] += 1.0
+    stages: list[str] = []
+    options: dict[str, Any] = {"input_delay": 0, "starts": 1, "sensor_noise": {}, "offset": {}}
+    calibrate(TANK, log, {"c": (0.2, 1.0)}, integration="backward-euler", progress=stages.append, **options)
+    assert "without samples that stand out" in stages
+    assert stages.count("boxes by profile likelihood") == 1
+    built: list[str] = []
+
+    def compiled(functions: Sequence[Any]) -> list[Any]:
+        built.extend(function.name() for function in functions)
+        return list(functions)
+
+    monkeypatch.setattr(step_graphs, "COMPILED_OPERATIONS", 0)
+    monkeypatch.setattr(step_graphs, "compiled", compiled)
+    graphs = step_graphs.sample_graphs(NonlinearPlant(TANK), ["c"], 0.1, integration="radau", substeps=1)
+    assert graphs.in_c
+    assert built == []
+    assert np.isfinite(np.array(graphs.solve([1.0], [0.5], [0.5])[0])).all()
+    assert built == ["solve", "sensitivities"]

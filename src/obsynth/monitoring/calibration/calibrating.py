@@ -447,6 +447,7 @@ class _Fitting:
         unseen = [name for name in problem.output_names if name not in states.offsets]
         if fit is None or not unseen or not problem.names:
             return fitted
+        own = fit.sides
         self.note("boxes beside offsets")
         wide = like_problem(
             problem, self.problem_with(replace(states, offsets=(*states.offsets, *unseen)), problem.log)
@@ -464,10 +465,10 @@ class _Fitting:
             return replace(fitted, problem=noted)
         sides = [
             (min(low, other_low, key=lambda side: side.value), max(high, other_high, key=lambda side: side.value))
-            for (low, high), (other_low, other_high) in zip(fit.sides, beside, strict=True)
+            for (low, high), (other_low, other_high) in zip(own, beside, strict=True)
         ]
         noted = problem.with_notes(OFFSETS_ALLOWED.format(", ".join(unseen), UNSEEN_OFFSET))
-        return replace(fitted, problem=noted, fit=replace(fit, sides=sides))
+        return replace(fitted, problem=noted, fit=replace(fit, box=lambda: sides))
 
     def without_outliers(self, fitted: _FittedProblem) -> _FittedProblem:
         """Return the fit again without samples that stand out alone or a few in a row: they would make R a multiple of

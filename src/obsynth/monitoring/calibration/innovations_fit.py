@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -60,7 +61,8 @@ class InnovationsFit:
     t: FloatArray
     value: float
     information: Information
-    sides: list[tuple[Side, Side]]
+    #: What computes the sides of the box: those of a fit that only leads to another one nobody reads.
+    box: Callable[[], list[tuple[Side, Side]]]
     Q: FloatArray
     R: FloatArray
     limited_Q: BoolArray
@@ -74,6 +76,11 @@ class InnovationsFit:
     #: The state after the last row, and its deviations, to which those of the constants are added; `None` where no
     #: offset of a sensor is asked of it, or there is no filter.
     at_end: tuple[FloatArray, FloatArray] | None = None
+
+    @cached_property
+    def sides(self) -> list[tuple[Side, Side]]:
+        """The box: the low and the high side of each constant."""
+        return self.box()
 
     @property
     def v(self) -> FloatArray:
@@ -168,9 +175,12 @@ def innovations_fit(
     moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, knowledge)
     if moved > TOLERATED_MOVE:
         return None, moved
-    note("boxes by profile likelihood")
-    root = _root(objective, level)
-    sides = profile_box(objective, maximum, root, knowledge, None if known is None else known.sides)
+
+    def box() -> list[tuple[Side, Side]]:
+        note("boxes by profile likelihood")
+        near = None if known is None else known.sides
+        return profile_box(objective, maximum, _root(objective, level), knowledge, near)
+
     # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
     Q, R = objective.noise(maximum.likeliest)
     limited, limits = _limits(objective, maximum)
@@ -184,7 +194,7 @@ def innovations_fit(
         t=objective.constants(maximum.z),
         value=objective.likelihood(objective.full(maximum.z))[0],
         information=knowledge,
-        sides=sides,
+        box=box,
         Q=Q,
         R=R,
         limited_Q=limited[: len(Q)],

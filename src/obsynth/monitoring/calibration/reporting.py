@@ -198,7 +198,7 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
         t=start.t,
         value=start.cost,
         information=information,
-        sides=sides,
+        box=lambda: sides,
         Q=nothing,
         R=start.deviations**2,
         limited_Q=nothing.astype(bool),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,11 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
         return list(functions)
 
 
-@lru_cache(maxsize=16)
+#: Libraries that are held: a calibration tries some twenty models of two each, and chooses one of them at last.
+HELD_LIBRARIES = 64
+
+
+@lru_cache(maxsize=HELD_LIBRARIES)
 def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tuple[Any, ...]:
     """Return functions of C code; the same code is compiled once."""
     with working_folder() as folder:
@@ -65,11 +69,10 @@ def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tupl
 class SampleGraphs:
     """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants."""
 
-    solve: Any  # from x, u, t to the stages of all substeps and the scaled residual that is left
-    sensitivities: Any  # from x, u, t, stages to what `local` takes as numbers: stages and their derivatives
+    written_solve: Any  # `solve` and `sensitivities` as graphs
+    written_sensitivities: Any
     local: Any  # from x, u, t, t and those numbers to the state after, F, G by t, and the noise's way
     outputs: Any  # from x, u, t to y, H and L by t
-    fast: Any  # `local`, to be evaluated and not to be differentiated
     nx: int
     nu: int
     ny: int
@@ -77,6 +80,27 @@ class SampleGraphs:
     numbers: int
     in_c: bool  # whether functions are machine code
     made: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def _solved(self) -> list[Any]:
+        # Compiled when it is needed: of a model that is then integrated in another way it is not.
+        functions = [self.written_solve, self.written_sensitivities]
+        return compiled(functions) if self.in_c else functions
+
+    @property
+    def solve(self) -> Any:
+        """From x, u, t to the stages of all substeps and the scaled residual that is left."""
+        return self._solved[0]
+
+    @property
+    def sensitivities(self) -> Any:
+        """From x, u, t, stages to what `local` takes as numbers: stages and their derivatives."""
+        return self._solved[1]
+
+    @cached_property
+    def fast(self) -> Any:
+        """`local`, to be evaluated and not to be differentiated."""
+        return compiled([self.local])[0] if self.in_c else self.local
 
 
 def sample_graphs(
@@ -102,21 +126,17 @@ def sample_graphs(
     sensitivities = ca.Function("sensitivities", [x, u, t, Z], [packed])
     outputs = plant.outputs(unknown)
     local = _local(base, substeps, nx, nu, nt)
-    fast, in_c = local, 8 * samples * local.n_instructions() > COMPILED_OPERATIONS
-    if in_c:
-        solve, sensitivities, fast = compiled([solve, sensitivities, local])
     return SampleGraphs(
-        solve=solve,
-        sensitivities=sensitivities,
+        written_solve=solve,
+        written_sensitivities=sensitivities,
         local=local,
         outputs=outputs,
-        fast=fast,
         nx=nx,
         nu=nu,
         ny=outputs.size1_out(0),
         nt=nt,
         numbers=packed.shape[0],
-        in_c=in_c,
+        in_c=8 * samples * local.n_instructions() > COMPILED_OPERATIONS,
     )
 
 
