@@ -86,19 +86,19 @@ def _windows(
     rng: np.random.Generator, test: ob.GuaranteedTest, window: Any, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return outputs and inputs ``(samples, windows, ...)`` of a plant with E = I, and the last row of the observer."""
-    plant, bounds, question, observer = window.plant, window.bounds, window.question, test.observer
-    count, free = len(sizes), list(question.free)
+    plant, bounds, test_problem, observer = window.plant, window.bounds, window.test_problem, test.observer
+    count, free = len(sizes), list(test_problem.free)
     x, z = SIZE * rng.uniform(-1.0, 1.0, (count, plant.nx)), np.zeros((count, observer.order))
     outputs, inputs, row = [], [], np.zeros((count, 1))
 
     def jumps(of: np.ndarray) -> np.ndarray:
         return np.asarray(of * rng.choice([-1.0, 1.0], (count, len(of))))
 
-    for k in range(question.samples):
+    for k in range(test_problem.samples):
         d, v, u = jumps(bounds.disturbance), jumps(bounds.noise), jumps(np.full(plant.nu, SIZE))
         f = np.zeros((count, plant.nf))
         f[:, free] = SIZE * rng.standard_normal((count, len(free)))
-        f[:, question.fault] = sizes if question.course == "constant" or k >= question.before else 0.0
+        f[:, test_problem.fault] = sizes if test_problem.course == "constant" or k >= test_problem.before else 0.0
         y = x @ plant.C.T + u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + v @ bounds.noise_output.T
         x = x @ plant.A.T + u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + v @ bounds.noise_state.T
         row = z @ observer.Cz.T + u @ observer.Du.T + y @ observer.Dy.T

@@ -82,3 +82,16 @@ def test_two_faults_that_only_an_unknown_input_makes_alike_are_said() -> None:
         "A constant drop cannot be distinguished from load and bias together",
         "A constant bias cannot be distinguished from load and drop together",
     ]
+
+
+def test_numbers_of_the_curve_have_the_unit_of_the_fault() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1}, fault_names=["leak"], units={"leak": "kg/s"}
+    )
+    curve = delay_curve(plant, 0, 0.01)
+    assert curve is not None
+    assert "leak (kg/s)" in curve.title
+    assert curve.sentence.count(" kg/s") == 3
+    bare = delay_curve(plant.replace(units={}), 0, 0.01)
+    assert bare is not None
+    assert "kg" not in bare.title + bare.sentence

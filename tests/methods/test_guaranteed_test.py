@@ -166,12 +166,12 @@ def healthy(design: obsynth.ObserverDesign, signs: np.ndarray, rng: np.random.Ge
     sizes = signs * np.where(window.bounded, window.bar, 0.0)
     s = dict(zip(window.labels, sizes.tolist(), strict=True))
     x, rows, inputs = 3.0 * rng.standard_normal(system.nx), [], []
-    question = window.question
-    for k in range(question.samples):
+    test_problem = window.test_problem
+    for k in range(test_problem.samples):
         d = np.array([s.get(("d", k, i), 0.0) for i in range(system.nd)])
         v = np.array([s.get(("w", k, i), 0.0) for i in range(system.ny)])
         u = rng.standard_normal(system.nu)
-        f = fault if question.course == "constant" or k >= question.before else 0.0
+        f = fault if test_problem.course == "constant" or k >= test_problem.before else 0.0
         rows.append(system.C @ x + system.Dd @ d + system.Df[:, 0] * f + (system.Dw @ v if system.nw else v))
         inputs.append(u)
         x = system.A @ x + system.B @ u + system.Bd @ d + system.Bf[:, 0] * f

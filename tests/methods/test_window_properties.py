@@ -73,8 +73,8 @@ def window_of(design: obsynth.GuaranteedTest) -> Any:
 def test_rows_are_lost_where_a_missing_sample_changes_them(seed: int, singular: bool) -> None:
     """Known inputs enter equations by B and outputs by D, outputs enter their own rows: no other row may be lost."""
     window, rng = window_of(design_of(seed, singular)), np.random.default_rng(seed)
-    length = max(window.equations, window.question.samples)
-    y, u = rng.standard_normal((window.question.samples, 2)), rng.standard_normal((length, 2))
+    length = max(window.equations, window.test_problem.samples)
+    y, u = rng.standard_normal((window.test_problem.samples, 2)), rng.standard_normal((length, 2))
     for signal, place in [("u", (1, 0)), ("u", (1, 1)), ("u", (length - 1, 0)), ("y", (2, 1)), ("y", (0, 0))]:
         blank = {"y": y.copy(), "u": u.copy()}
         blank[signal][place] = np.nan
@@ -119,16 +119,16 @@ def test_a_row_is_decided_with_what_is_known_then() -> None:
         chain(), course="constant", samples=5, noise_bound={"y1": 0.1, "y2": 0.1}, free="none", exact=True
     )
     whole = window_of(design)
-    assert whole.question.closing == 2
+    assert whole.test_problem.closing == 2
     programmes = Programmes.of(design)
     rows = design.linear[1].order + 1
     assert programmes.window.equations <= rows
     low, high = programmes.interval(np.zeros((rows, 2)), np.zeros((rows, 1)))
     assert low < 0.0 < high
     shorter = Programmes(whole, 0)
-    assert shorter.window.question.closing == 0
-    assert Programmes(whole, 2).window.question.closing == 2
-    assert Programmes(whole, 5).window.question.closing == 2
+    assert shorter.window.test_problem.closing == 0
+    assert Programmes(whole, 2).window.test_problem.closing == 2
+    assert Programmes(whole, 5).window.test_problem.closing == 2
 
 
 @pytest.mark.parametrize("norm", ["box", "ellipsoid"])

@@ -22,7 +22,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.proof_file import proof_bytes, proof_of
-from obsynth.exporting.proof_of_tests import fractions_data, question_of_window, window_of_test
+from obsynth.exporting.proof_of_tests import fractions_data, window_as_data, window_of_test
 from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.proofs.witnesses import Dyadic, number_data
@@ -124,14 +124,14 @@ def alarm_proof_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
         )
     design = loaded(json.dumps(certificate["gain_set"]).encode(), "the gain set of the alarm")
     tests = tests_of(design, GuaranteedTestMethod.of) if is_bank(design) else (design,)
-    place = [test.linear[0].fault_names[window_of_test(test).question.fault] for test in tests].index(
+    place = [test.linear[0].fault_names[window_of_test(test).test_problem.fault] for test in tests].index(
         certificate["test"]
     )
     window = window_of_test(tests[place]).outer
     y, u = (np.asarray(restored(certificate[name]), dtype=np.float64) for name in ("y", "u"))
     claim = {
         "claim": "alarm",
-        "window": question_of_window(window),
+        "window": window_as_data(window),
         "multipliers": fractions_data([Fraction(text) for text in certificate["multipliers"]]),
         "y": Dyadic.of(y.reshape(len(y), -1)).data(),
         "u": Dyadic.of(u.reshape(len(y), -1) if u.size else np.zeros((len(y), 0))).data(),

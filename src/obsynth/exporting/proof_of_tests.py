@@ -59,7 +59,7 @@ def _threshold(design: ObserverDesign, test: ObserverDesign, window: Window, row
     rounding, constant = _rounding(design, window, exact, row)
     return {
         "claim": "threshold",
-        "window": question_of_window(window),
+        "window": window_as_data(window),
         "multipliers": fractions_data(exact),
         "threshold": number_data(stated),
         "row": row,
@@ -81,7 +81,7 @@ def _least(test: ObserverDesign, window: Window) -> dict[str, Any] | None:
     share = Fraction(least) / point[0]
     return {
         "claim": "least",
-        "window": question_of_window(window),
+        "window": window_as_data(window),
         "point": fractions_data([value * share for value in point]),
         "least": number_data(least),
     }
@@ -92,28 +92,28 @@ def window_of_test(test: ObserverDesign) -> Window:
     return window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
 
 
-def question_of_window(window: Window) -> dict[str, Any]:
+def window_as_data(window: Window) -> dict[str, Any]:
     """Return what the checker forms the same equations from."""
-    question, bounds = window.question, window.bounds
+    test_problem, bounds = window.test_problem, window.bounds
     middles = {
         "disturbances": bounds.disturbance_middle,
         "noise": bounds.noise_middle,
     }
     counts = {"disturbances": len(bounds.disturbance), "noise": len(bounds.noise)}
-    rates = question.disturbance_rate if len(question.disturbance_rate) else np.zeros(counts["disturbances"])
+    rates = test_problem.disturbance_rate if len(test_problem.disturbance_rate) else np.zeros(counts["disturbances"])
     return {
-        "samples": question.samples,
+        "samples": test_problem.samples,
         "prior": 0,
         "equations": window.equations,
-        "fault": question.fault,
-        "course": question.course,
-        "lag": question.lag,
-        "before": question.before,
-        "free": list(question.free),
-        "free_course": question.free_course,
-        "disturbance": question.disturbance,
+        "fault": test_problem.fault,
+        "course": test_problem.course,
+        "lag": test_problem.lag,
+        "before": test_problem.before,
+        "free": list(test_problem.free),
+        "free_course": test_problem.free_course,
+        "disturbance": test_problem.disturbance,
         "between_samples": _between_samples(window),
-        "norm": "ellipsoid" if question.ellipsoid else "box",
+        "norm": "ellipsoid" if test_problem.ellipsoid else "box",
         "noise_state": Dyadic.of(bounds.noise_state).data(),
         "noise_output": Dyadic.of(bounds.noise_output).data(),
         "bounds": {
@@ -122,7 +122,7 @@ def question_of_window(window: Window) -> dict[str, Any]:
             "states": [_bound(value) for value in bounds.state],
             "first": [_bound(value) for value in bounds.first],
             "rates": [_bound(value) for value in rates],
-            "fault_rate": [_bound(question.fault_rate)],
+            "fault_rate": [_bound(test_problem.fault_rate)],
         },
         "middles": {
             kind: [number_data(float(value)) for value in (np.zeros(counts[kind]) if middle is None else middle)]
@@ -227,7 +227,7 @@ def _largest(window: Window, parts: list[Fraction]) -> Fraction:
     alone, groups = Fraction(0), dict[int, Fraction]()
     for j in np.flatnonzero(window.bounded).tolist():
         part, group = Fraction(float(window.bar[j])) * abs(parts[j]), int(window.group[j])
-        if window.question.ellipsoid and group >= 0:
+        if window.test_problem.ellipsoid and group >= 0:
             groups[group] = groups.get(group, Fraction(0)) + part**2
         else:
             alone += part
@@ -243,7 +243,7 @@ def _excess(window: Window, point: list[Fraction]) -> Fraction:
             continue
         share = abs(point[j]) / bar
         worst = max(worst, share)
-        if window.question.ellipsoid and group >= 0:
+        if window.test_problem.ellipsoid and group >= 0:
             groups[group] = groups.get(group, Fraction(0)) + share**2
     return max([worst, *(Fraction(root_above(value)) for value in groups.values())])
 
@@ -271,16 +271,16 @@ class _Weights:
 
     def __init__(self, window: Window, multipliers: list[Fraction]) -> None:
         self.window, self.multipliers = window, multipliers
-        length = max(window.equations, window.question.samples)
+        length = max(window.equations, window.test_problem.samples)
         used = [k for k in range(length) if any(self.at(k))]
-        self.last = max([*used, window.question.samples - 1])
+        self.last = max([*used, window.test_problem.samples - 1])
 
     def at(self, k: int) -> list[Fraction]:
         """Return the weights of u and y at sample k."""
         window, plant = self.window, self.window.plant
         nx, ny, zero = plant.nx, plant.ny, [Fraction(0)] * plant.ny
         first = window.outputs_at + k * ny
-        of_y = self.multipliers[first : first + ny] if k < window.question.samples else zero
+        of_y = self.multipliers[first : first + ny] if k < window.test_problem.samples else zero
         of_x = self.multipliers[k * nx : (k + 1) * nx] if k < window.equations else [Fraction(0)] * nx
         on_u = [
             sum((w * Fraction(float(plant.B[r, j])) for r, w in enumerate(of_x)), start=Fraction(0))

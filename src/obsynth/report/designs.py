@@ -115,7 +115,7 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
             table.add_row(*map(Text, row))
         print_section(console, f"{headings[0].capitalize()} estimates", table)
     for curve in delay_curves(design):
-        print_section(console, f"Noise of the estimate of {curve.fault} against delay", delay_table(curve))
+        print_section(console, curve.title, delay_table(curve))
         console.print(Text(curve.sentence))
         console.print()
     if design.recovery is not None:
@@ -146,8 +146,9 @@ def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
 
 
 def delay_table(curve: DelayCurve) -> Table:
-    """Return deviations by walk (rows) and lag in samples (columns)."""
-    table = headed_table("assumed fault drift per sample", *(f"delay {lag}" for lag in curve.lags))
+    """Return deviations of the estimate by walk of the fault (rows) and delay in samples (columns)."""
+    unit = f" ({curve.unit})" if curve.unit else ""
+    table = headed_table(f"walk per sample{unit}", *(f"delay {lag}" for lag in curve.lags))
     for rate, row in zip(curve.rates, curve.deviations, strict=True):
         table.add_row(Text(number(rate, digits=3)), *(Text(number(float(value), digits=3)) for value in row))
     return table

@@ -191,7 +191,7 @@ def _fits(design: ObserverDesign) -> bool:
 
 def _delay(design: ObserverDesign) -> Iterator[str]:
     for curve in delay_curves(design):
-        yield f"<h3>{escape(curve.fault)}</h3>"
+        yield f"<h3>{escape(curve.title)}</h3>"
         yield from copied_table(delay_table(curve))
         yield f"<p>{escape(curve.sentence)}</p>"
 

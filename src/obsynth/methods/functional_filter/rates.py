@@ -232,12 +232,21 @@ def _required_gain(gain: KalmanGain | None) -> KalmanGain:
 
 @dataclass(frozen=True, eq=False)
 class DelayCurve:
-    """Fields: fault; rates: walks per sample; lags: samples; deviations ``(rates, lags)`` of the delayed error."""
+    """Deviations ``(rates, lags)`` of the delayed error of the estimate of a fault, in its ``unit`` (empty: not known).
+
+    ``rates``: deviations of the steps of a walk of the fault, in that unit per sample; ``lags``: samples."""
 
     fault: str
     rates: tuple[float, ...]
     lags: tuple[int, ...]
     deviations: FloatArray
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """What the deviations are of, and their unit."""
+        unit = f" ({self.unit})" if self.unit else ""
+        return f"Standard deviation of the estimate of {self.fault}{unit} against its delay in samples"
 
     @property
     def sentence(self) -> str:
@@ -245,10 +254,10 @@ class DelayCurve:
         row = self.deviations[len(self.rates) // 2]
         rate = self.rates[len(self.rates) // 2]
         at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
+        unit = f" {self.unit}" if self.unit else ""
         return (
-            f"{self.fault}: for a random-walk intensity of {rate:.3g} per sample one sample of delay takes the "
-            "deviation from "
-            f"{at[0]:.3g} to {at[1]:.3g}, five samples to {at[5]:.3g}."
+            f"{self.fault}: for a random walk by {rate:.3g}{unit} per sample one sample of delay takes the deviation "
+            f"from {at[0]:.3g} to {at[1]:.3g}{unit}, five samples to {at[5]:.3g}{unit}."
         )
 
 
@@ -272,7 +281,9 @@ def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) 
     except ObsynthError:
         return None
     rates = tuple(factor * middle for factor in FACTORS)
-    return DelayCurve(plant.fault_names[fault], rates, TRIED_LAGS, np.array(rows))
+    name = plant.fault_names[fault]
+    unit = plant.units.get(name, "")
+    return DelayCurve(name, rates, TRIED_LAGS, np.array(rows), "" if unit == "1" else unit)
 
 
 def _smoothed(

@@ -124,9 +124,9 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
 def _single_observer(observer: LinearObserver, window: Any, fault: int, registers: int, length: int) -> LinearObserver:
     """Return the row of one test with its own registers, named as the test alone has it."""
     at, own = slice(fault * registers, fault * registers + length), [fault]
-    estimated = window.question.course != "step"
+    estimated = window.test_problem.course != "step"
     name = (window.plant.fault_names[fault],)
-    delay = length + 1 - window.question.samples
+    delay = length + 1 - window.test_problem.samples
     return replace(
         observer,
         Az=observer.Az[at, at],
@@ -136,7 +136,7 @@ def _single_observer(observer: LinearObserver, window: Any, fault: int, register
         Du=observer.Du[own],
         Dy=observer.Dy[own],
         fault_names=name if estimated else (),
-        fault_delays=(window.question.lag + delay,) if estimated else (),
+        fault_delays=(window.test_problem.lag + delay,) if estimated else (),
         residual_names=() if estimated else name,
         constant=observer.added[own],
     )

@@ -189,7 +189,7 @@ def _what_does_not_fit(
     nx, names = plant.nx, design.linear[1].state_names
     if names or {"state_tracking", "record"} & set(shipped):
         order, steps = (len(shipped.get(name, ())) for name in ("state_tracking", "record"))
-        known = max(steps, windows[0].question.samples) * (plant.nu + plant.ny)
+        known = max(steps, windows[0].test_problem.samples) * (plant.nu + plant.ny)
         sizes = {"state_tracking": order * nx, "state_rows": nx**2, "record": known}
         parts = ((name, size, shipped.get(name)) for name, size in sizes.items())
         wrong += [name for name, size, m in parts if m is None or m.size != size or not np.isfinite(m).all()]
@@ -350,7 +350,7 @@ def known_room(window: Window, multipliers: FloatArray) -> float:
     """Return how far weights of known inputs may be from those that the multipliers say, by the order of sums."""
     nx, ne, _, ny = window.model.sizes
     equations = np.abs(multipliers[: window.outputs_at]).reshape(window.equations, ne)
-    outputs = np.abs(multipliers[window.outputs_at :][: window.question.samples * ny])
+    outputs = np.abs(multipliers[window.outputs_at :][: window.test_problem.samples * ny])
     sizes = [part @ np.abs(inputs) for part, (_, _, inputs) in zip(equations, window.model.equations, strict=True)]
     size = float(np.max(sizes, initial=0.0))
     size += float(np.max(outputs.reshape(-1, ny) @ np.abs(window.model.D), initial=0.0))

@@ -65,7 +65,7 @@ class Condensed:
         """Return it, or ``None`` where the window is small or has not this structure."""
         if window.rows < FEWEST_ROWS or not isinstance(window.model.plant, DescriptorSystem):
             return None
-        plant, samples = window.plant, window.question.samples
+        plant, samples = window.plant, window.test_problem.samples
         bounds = window.bounds
         # Products of entries and whole numbers would be rounded.
         is_plain = window.rows == window.outputs_at + samples * plant.ny and np.abs(window.times).max(initial=1) == 1
@@ -92,7 +92,7 @@ class Condensed:
         window, plant = self.window, self.window.plant
         dense = window.matrix[:, columns].toarray()
         equations = dense[: window.outputs_at].reshape(window.equations, plant.nx, -1)
-        outputs = dense[window.outputs_at :].reshape(window.question.samples, plant.ny, -1)
+        outputs = dense[window.outputs_at :].reshape(window.test_problem.samples, plant.ny, -1)
         return list(equations), list(outputs)
 
     @cached_property
@@ -209,7 +209,7 @@ class Condensed:
         noise = window.bounds.noise_output[:, self._noise_columns]
         back = arb_matrix(noise).inv()
         witness, distance = np.array(values), np.zeros(len(values))
-        for k in range(window.question.samples):
+        for k in range(window.test_problem.samples):
             residual = back * (c * state + arb_matrix(outputs[k]) * known)
             self._put(witness, distance, absorbing[k], -residual)
             if k < window.equations:
@@ -240,5 +240,5 @@ class Condensed:
         if not len(self._noise_columns):
             return None
         labels = {label: k for k, label in enumerate(self.window.labels)}
-        samples = range(self.window.question.samples)
+        samples = range(self.window.test_problem.samples)
         return np.array([[labels["w", k, int(i)] for i in self._noise_columns] for k in samples])

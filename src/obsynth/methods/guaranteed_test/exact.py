@@ -51,9 +51,9 @@ class Programmes:
     """The programmes of a test: one for each pattern of missing rows, made when it is first met."""
 
     def __init__(self, window: Window, delay: int) -> None:
-        if window.question.closing > delay:
+        if window.test_problem.closing > delay:
             # What follows the last known input is not known when the row is prescribed.
-            window = window_of(window.plant, window.bounds, replace(window.question, closing=delay))
+            window = window_of(window.plant, window.bounds, replace(window.test_problem, closing=delay))
         self.window, self.delay = window, delay
         self._kept: dict[bytes, _Programme] = {}
 
@@ -61,7 +61,7 @@ class Programmes:
     def of(cls, design: ObserverDesign) -> Self:
         """Return the programmes of a single test."""
         window = window_as_designed(design.linear[0], GuaranteedTestMethod.of(design.options))
-        return cls(window, rows_before(design) + 1 - window.question.samples)
+        return cls(window, rows_before(design) + 1 - window.test_problem.samples)
 
     def __reduce__(self) -> Any:
         # HiGHS cannot be pickled: programmes are made again.
@@ -71,7 +71,7 @@ class Programmes:
         """Return the programme, the right sides, and the largest known signals ``(nu + ny,)``."""
         outputs = np.array(y)
         # After the last sample of the window only inputs count.
-        right, lost = known_rows(self.window, outputs[: self.window.question.samples], u)
+        right, lost = known_rows(self.window, outputs[: self.window.test_problem.samples], u)
         key = lost.tobytes()
         if key not in self._kept:
             if len(self._kept) == KEPT_PATTERNS:

@@ -83,8 +83,8 @@ def conditions(
 
 def detectability(problem: WindowProblem, options: TestOptions) -> tuple[Condition, int]:
     """Return the condition that some window tells the fault, and the lag with which it does."""
-    lags = [problem.question.lag]
-    if problem.question.course == "any" and options.lag is None:
+    lags = [problem.test_problem.lag]
+    if problem.test_problem.course == "any" and options.lag is None:
         lags = list(range(problem.plant.nx + 2))
     if isinstance(problem.plant, TimeVaryingDescriptorSystem):
         lags = [lag for lag in lags if lag < _samples_by_row(problem, options)] or lags[:1]
@@ -109,7 +109,7 @@ def _decisive(problem: WindowProblem, options: TestOptions, lag: int) -> Iterato
         yield from (problem.window(samples, lag=lag, row=row) for row in reversed(rows))
         return
     most = samples_decided_on(problem, options, lag)
-    least = max(problem.question.before, lag) + 2
+    least = max(problem.test_problem.before, lag) + 2
     # A test on fewer samples is one on more: short windows are decided in no time.
     doubled = [least * 2**k for k in range(most.bit_length())]
     yield from (problem.window(samples, lag=lag) for samples in (*(tried for tried in doubled if tried < most), most))
@@ -157,7 +157,7 @@ def least_multipliers(window: Window) -> FloatArray | None:
 
 def detectability_condition(window: Window, holds: bool, detail: str) -> Condition:
     """Return the condition that a window tells the fault, in words."""
-    fault = fault_names(window.model.plant)[window.question.fault]
+    fault = fault_names(window.model.plant)[window.test_problem.fault]
     return Condition(
         "fault detectable",
         f"{fault} changes the samples in a way that no free signal does",
@@ -174,7 +174,7 @@ def _hiding_in_words(problem: WindowProblem, options: TestOptions, window: Windo
     """Return in words what hides the fault."""
     fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
     point = proved_ray(window)
-    samples = window.question.samples
+    samples = window.test_problem.samples
     if point is None and varies:
         return (
             f"no weights of {samples} samples respond to {fault} and to nothing that is free at the rows that were "
@@ -190,8 +190,8 @@ def _hiding_in_words(problem: WindowProblem, options: TestOptions, window: Windo
     text = f"{hidden(window, point)} (proved for {where}: every equation holds exactly)."
     if varies:
         return text
-    lag = window.question.lag
-    if problem.question.course == "any" and options.lag is not None:
+    lag = window.test_problem.lag
+    if problem.test_problem.course == "any" and options.lag is not None:
         for more in range(lag + 1, problem.plant.nx + 2):
             if has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
                 return f"{text} The least lag for which there is a test is {more}."
@@ -204,13 +204,13 @@ def _hiding_in_words(problem: WindowProblem, options: TestOptions, window: Windo
 
 def hidden(window: Window, point: FloatArray) -> str:
     """Return which signals together look like nothing."""
-    plant, question = window.model.plant, window.question
+    plant, test_problem = window.model.plant, window.test_problem
     names = fault_names(plant)
-    fault = names[question.fault]
+    fault = names[test_problem.fault]
     largest = float(np.max(np.abs(point)))
     other_faults = []
     for label, value in zip(window.labels, point, strict=True):
-        if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD_COURSE * largest:
+        if label[0] == "f" and label[2] != test_problem.fault and abs(value) > TOLD_COURSE * largest:
             name = names[label[2]]
             if name not in other_faults:
                 other_faults.append(name)

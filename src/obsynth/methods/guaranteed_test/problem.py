@@ -63,13 +63,13 @@ class WindowProblem:
 
     plant: DescriptorSystem | TimeVaryingDescriptorSystem
     bounds: Bounds
-    question: TestProblem  # of one sample more than its course needs
+    test_problem: TestProblem  # of one sample more than its course needs
 
     def window(self, samples: int, *, lag: int | None = None, row: int = 0) -> Window:
         """Return the stacked equations of so many samples, of which the last is that of k = ``row``."""
-        lag = self.question.lag if lag is None else lag
+        lag = self.test_problem.lag if lag is None else lag
         start = 1 if self.horizon is None else row - samples + 1
-        return window_of(self.plant, self.bounds, replace(self.question, samples=samples, lag=lag), start)
+        return window_of(self.plant, self.bounds, replace(self.test_problem, samples=samples, lag=lag), start)
 
     @property
     def horizon(self) -> int | None:
@@ -79,22 +79,22 @@ class WindowProblem:
     @property
     def fault(self) -> str:
         """Name of the fault that is looked for."""
-        return fault_names(self.plant)[self.question.fault]
+        return fault_names(self.plant)[self.test_problem.fault]
 
     @property
     def shortest(self) -> int:
         """The least number of samples that the course fits in."""
-        return max(self.question.before, self.question.lag) + 1
+        return max(self.test_problem.before, self.test_problem.lag) + 1
 
     def enough(self, lag: int) -> int:
         """Return samples after which more of them make no test possible that there was none before."""
-        return self.question.before + 2 * self.plant.nx + 2 + lag
+        return self.test_problem.before + 2 * self.plant.nx + 2 + lag
 
     def ladder(self) -> tuple[int, ...]:
         """Return the numbers of samples to try; of a large plant fewer."""
         most = max(MOST_WINDOW_STATES // max(self.plant.nx, 1), self.shortest)
         most = most if self.horizon is None else min(most, self.horizon)
-        lengths = [self.question.before + rung for rung in CANDIDATE_LENGTHS]
+        lengths = [self.test_problem.before + rung for rung in CANDIDATE_LENGTHS]
         return tuple(rung for rung in lengths if self.shortest <= rung <= most) or (self.shortest,)
 
     def rows(self, samples: int) -> range:
@@ -146,7 +146,7 @@ class WindowProblem:
     def continues(self, window: Window, row: int) -> bool:
         """Whether what satisfies the equations of a window satisfies those after it, with some later states."""
         continuing = self._continuing
-        after = 1 if self.horizon is None else row - window.question.samples + 1 + window.equations
+        after = 1 if self.horizon is None else row - window.test_problem.samples + 1 + window.equations
         return bool(continuing[min(after, len(continuing) - 1)])
 
     def is_of_a_running_plant(self, window: Window, row: int, point: FloatArray, radius: FloatArray) -> bool:
@@ -154,7 +154,7 @@ class WindowProblem:
         first = [place for place, label in enumerate(window.labels) if label[:2] == ("x", 0)]
         # A plant that starts at rest, exactly, has been at rest.
         at_rest = not np.any(point[first]) and not np.any(radius[first])
-        return self.continues(window, row) and (at_rest or self.has_past(row, window.question.samples))
+        return self.continues(window, row) and (at_rest or self.has_past(row, window.test_problem.samples))
 
 
 def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
@@ -166,7 +166,7 @@ def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
     return decide_rank(np.vstack([before, without @ a])).rank == decide_rank(before).rank + len(without)
 
 
-def question_of(options: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
+def test_problem_of(options: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
     """Return what is looked for, of one sample more than its course needs."""
     names, before = fault_names(plant), options.before if options.course == "step" else 0
     fault, rates = fault_of(names, options.fault), np.zeros(0)
@@ -211,8 +211,8 @@ def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: T
                 "as many steps as the log has.",
                 path="plant.horizon",
             )
-    question = question_of(options, plant)
-    return WindowProblem(plant, bounds_of(plant, options), question)
+    test_problem = test_problem_of(options, plant)
+    return WindowProblem(plant, bounds_of(plant, options), test_problem)
 
 
 def require_linear_options(options: TestOptions) -> None:
@@ -261,7 +261,7 @@ class WindowProgrammes:
 def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> WindowProblem:
     """Return the problem of options as a design ships them: with the lag."""
     problem = problem_of(plant, options)
-    return replace(problem, question=replace(problem.question, lag=options.lag or 0))
+    return replace(problem, test_problem=replace(problem.test_problem, lag=options.lag or 0))
 
 
 def window_as_designed(plant: DescriptorSystem, options: TestOptions) -> Window:

@@ -47,7 +47,7 @@ class Optimum:
 
 def largest_hidden_fault(window: Window) -> Optimum:
     """Return the largest theta of the equations with zero right sides."""
-    if window.question.ellipsoid:
+    if window.test_problem.ellipsoid:
         return _in_ellipsoids(window)
     from scipy.optimize import linprog
     from scipy.sparse import diags_array
@@ -67,7 +67,7 @@ def largest_hidden_fault(window: Window) -> Optimum:
         return Optimum(np.inf)
     if solution.status != SOLVED_STATUS:
         raise SolverError(
-            f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
+            f"HiGHS has no answer for the linear programme of {window.test_problem.samples} samples (status "
             f"{solution.status}): the result is inconclusive. "
             "Fewer samples, or signals in units in which they are near one, may help."
         )

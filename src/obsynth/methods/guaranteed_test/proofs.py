@@ -81,7 +81,7 @@ def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Frac
     for k in range(window.equations):
         for r in range(plant.nx):
             sides[k * plant.nx + r] = times(plant.B[r], u[k])
-    for k in range(window.question.samples):
+    for k in range(window.test_problem.samples):
         for r in range(plant.ny):
             place = window.outputs_at + k * plant.ny + r
             sides[place] = Fraction(float(y[k, r])) - times(plant.D[r], u[k])
@@ -196,7 +196,7 @@ def proved_threshold(window: Window, repaired: NearbySolution, *, exact_zero: bo
     away = _absolute(window, repaired.radius)
     bounded = np.flatnonzero(window.bounded)
     parts = [Fraction(float(window.bar[j])) * (abs(columns[j]) + away[j]) for j in bounded]
-    if not window.question.ellipsoid:
+    if not window.test_problem.ellipsoid:
         return rounded_outward(sum(parts, start=standing))
     return sum_in_ellipsoids(window, parts, rounded_outward(standing))
 
@@ -220,9 +220,9 @@ def proved_least(window: Window, repaired: NearbySolution) -> float:
     sizes = rounded_up((np.abs(repaired.values) + repaired.radius)[bounded], 2) / window.bar[bounded]
     sizes = rounded_up(sizes, 2)
     groups = window.group[bounded]
-    alone = sizes if not window.question.ellipsoid else sizes[groups < 0]
+    alone = sizes if not window.test_problem.ellipsoid else sizes[groups < 0]
     worst = float(np.max(alone, initial=1.0))
-    if window.question.ellipsoid:
+    if window.test_problem.ellipsoid:
         for group in np.unique(groups[groups >= 0]):
             part = sizes[groups == group]
             worst = float(np.maximum(worst, rounded_up(np.sqrt(np.sum(part**2)), 2 * len(part) + 8)))

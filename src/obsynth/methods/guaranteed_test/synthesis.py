@@ -97,7 +97,7 @@ def synthesise(
     require_all(conditions(plant, options, with_windows=False))
     condition, lag = detectability(problem, options)
     condition.require()
-    problem = replace(problem, question=replace(problem.question, lag=lag))
+    problem = replace(problem, test_problem=replace(problem.test_problem, lag=lag))
     stated_samples = samples_given(options)
     most = problem.ladder()[-1] if stated_samples == "auto" else int(stated_samples)
     progress(f"solving linear programmes of up to {most} samples, which take {in_time(plant.nx, most)}")
@@ -236,8 +236,8 @@ def proved_test(window: Window, optimum: Optimum) -> Shipped:
     test = repaired_multipliers(window, optimum.multipliers, refine=True)
     if test is None:
         raise SolverError(
-            f"Weights of {window.question.samples} samples were found, but double precision cannot tell how far they "
-            "are from exact ones: the result is inconclusive. Fewer samples, or signals in units near one, help."
+            f"Weights of {window.test_problem.samples} samples were found, but double precision cannot tell how far "
+            "they are from exact ones: the result is inconclusive. Fewer samples, or signals in units near one, help."
         )
     test = test.with_room(rows)
     inner = window.inner
@@ -258,7 +258,7 @@ def _synthesis(
     table: FloatArray,
     beside: Beside | None,
 ) -> Synthesis:
-    first, question = programmes.windows[0], programmes.windows[0].question
+    first, test_problem = programmes.windows[0], programmes.windows[0].test_problem
     multipliers = [
         np.zeros(window.rows) if proved is None else proved.test.values
         for window, proved in zip(programmes.windows, shipped, strict=True)
@@ -275,14 +275,14 @@ def _synthesis(
     if np.isfinite(leasts[used]).any():
         claims["least"] = float(np.nanmax(leasts[used]))
     shipped_options: dict[str, Any] = {option.name: getattr(options, option.name) for option in fields(TestOptions)} | {
-        "samples": question.samples,
-        "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
+        "samples": test_problem.samples,
+        "lag": test_problem.lag if test_problem.course in ("any", "ramp", "rate") else None,
         "fault": problem.fault,
     }
     if not isinstance(problem.plant, DescriptorSystem):
         has_test = np.array([proved is not None for proved in shipped])
         weighing = observer_of_rows(problem, programmes, has_test, multipliers)
-        by_row = tuple(_notes_of_rows(problem, claims, matrices, question))
+        by_row = tuple(_notes_of_rows(problem, claims, matrices, test_problem))
         certificate = Certificate(matrices | {TRADE_OFF: table}, claims)
         return Synthesis(shipped_options, {"weights": weighing.weights}, weighing, certificate, notes=by_row)
     observer = observer_of(first, multipliers[0], None if beside is None else beside.observer)
@@ -344,7 +344,7 @@ def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: Nearb
 def _notes(
     problem: WindowProblem, options: TestOptions, window: Window, claims: Mapping[str, float], table: FloatArray
 ) -> list[str]:
-    question, threshold, least = window.question, claims["threshold"], claims.get("least")
+    test_problem, threshold, least = window.test_problem, claims["threshold"], claims.get("least")
     words, mean = [], claims.get("mean_threshold")
     if threshold == 0.0:
         words.append(
@@ -353,8 +353,8 @@ def _notes(
     elif least is not None:
         kind = disturbances_in_words(window) if isinstance(problem.plant, DescriptorSystem) else ""
         words.append(
-            f"The threshold is {threshold:.4g}; the smallest possible with {question.samples} samples is {least:.4g} "
-            f"(proved{f', for {kind}' if kind else ''}). "
+            f"The threshold is {threshold:.4g}; the smallest possible with {test_problem.samples} samples is "
+            f"{least:.4g} (proved{f', for {kind}' if kind else ''}). "
             + (
                 f"A fault of {2.0 * threshold:.4g} is certain to raise an alarm."
                 if mean is None
@@ -366,16 +366,16 @@ def _notes(
                 "As states have bounds, the latter is about intervals: no function of the samples estimates the fault "
                 "to within less, but a fault of less than twice that size may be detectable."
             )
-    elif not problem.has_past(0, question.samples):
+    elif not problem.has_past(0, test_problem.samples):
         words.append(
             "That there is no smaller threshold is not claimed: A is singular, as with a delay, so that what went "
             "before the window says more of its first state."
         )
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
-    words.append(f"The course {question.course} is {COURSES[question.course]}.")
-    if question.course == "any" and options.lag is None:
-        words.append(f"The least lag with which {problem.fault} can be estimated is {question.lag}.")
+    words.append(f"The course {test_problem.course} is {COURSES[test_problem.course]}.")
+    if test_problem.course == "any" and options.lag is None:
+        words.append(f"The least lag with which {problem.fault} can be estimated is {test_problem.lag}.")
     if mean is not None:
         words.append(
             "Over the tolerances of the constants the threshold follows the signals, and the weights are those with "
@@ -390,7 +390,9 @@ def _notes(
         )
     if len(table) > 1:
         listed = ", ".join(f"{int(row[0])}: {row[-1]:.4g}" for row in table)
-        words.append(f"Samples and thresholds (by linear programmes; that of {question.samples} is proved): {listed}.")
+        words.append(
+            f"Samples and thresholds (by linear programmes; that of {test_problem.samples} is proved): {listed}."
+        )
         if problem.plant.nx * table[-1, 0] * 2 > MOST_WINDOW_STATES:
             words.append(
                 f"The table ends at {int(table[-1, 0])} samples, as its programmes grow with samples times states: "
@@ -400,7 +402,7 @@ def _notes(
 
 
 def _notes_of_rows(
-    problem: WindowProblem, claims: Mapping[str, float], matrices: Mapping[str, FloatArray], question: TestProblem
+    problem: WindowProblem, claims: Mapping[str, float], matrices: Mapping[str, FloatArray], test_problem: TestProblem
 ) -> Iterator[str]:
     thresholds, of_row = matrices["thresholds"], matrices["programmes"].astype(np.int64)
     without = int(np.sum(of_row < 0))
@@ -408,19 +410,19 @@ def _notes_of_rows(
     forever = problem.horizon is None
     rows = "every row from" if forever else f"the {len(of_row)} rows from"
     yield (
-        f"{counted(len(thresholds), 'linear programme')} for {rows} k = {question.samples} on, each proved: "
+        f"{counted(len(thresholds), 'linear programme')} for {rows} k = {test_problem.samples} on, each proved: "
         f"thresholds from {used.min():.6g} to {used.max():.6g}; the largest one is claimed."
     )
     if without:
         yield (
-            f"{without} rows have no verdict: no weights of {question.samples} samples respond to the fault and to "
+            f"{without} rows have no verdict: no weights of {test_problem.samples} samples respond to the fault and to "
             "nothing that is free."
         )
     if "least" not in claims:
         yield "That there is no smaller threshold is not claimed: equations before or after the window may reduce it."
     elif np.isnan(matrices["leasts"]).any():
         yield "At some rows it is not claimed that there is no smaller threshold."
-    yield f"The course {question.course} is {COURSES[question.course]}."
+    yield f"The course {test_problem.course} is {COURSES[test_problem.course]}."
     yield (
         f"A fault of k acts on the way to sample k + 1; {', '.join(disturbance_names(problem.plant))} stand for mu(k) "
         "in the equations."

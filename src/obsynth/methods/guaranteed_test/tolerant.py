@@ -114,7 +114,7 @@ def noisy_as_bounded(window: Window) -> DescriptorSystem:
 def with_tolerances(window: Window, beside: Beside) -> Window:
     """Return a window with a bounded column for each thing that tolerances do, in the mean over the record."""
     affine, builder = beside.affine, Builder()
-    length = max(window.equations + 1, window.question.samples)
+    length = max(window.equations + 1, window.test_problem.samples)
     starts = np.unique(np.linspace(*settled(len(beside.record), length), MOST_WINDOWS).astype(np.int64))
     nu = window.plant.nu
     spans = 1.0 + np.abs(affine.offsets)
@@ -125,7 +125,7 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
         first = builder.columns([("tolerance", k, i) for i in range(len(columns))], columns)
         for matrix, row in zip(matrices, (k - 1, k, k), strict=True):
             output = matrix is matrices[2]
-            if 0 <= row < (window.question.samples if output else window.equations):
+            if 0 <= row < (window.test_problem.samples if output else window.equations):
                 place = window.outputs_at + row * window.plant.ny if output else row * window.plant.nx
                 builder.put(place, matrix, first)
 
@@ -136,8 +136,8 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
         for j, span in enumerate(spans):
             into = x[1 : window.equations + 1] @ affine.E.parts[j].T
             into = into - x[: window.equations] @ affine.A.parts[j].T - u[: window.equations] @ affine.B.parts[j].T
-            onto_outputs = x[: window.question.samples] @ affine.C.parts[j].T
-            onto_outputs = onto_outputs + u[: window.question.samples] @ affine.D.parts[j].T
+            onto_outputs = x[: window.test_problem.samples] @ affine.C.parts[j].T
+            onto_outputs = onto_outputs + u[: window.test_problem.samples] @ affine.D.parts[j].T
             column = builder.columns([("tolerance", start, j)], [span / len(starts)])
             builder.put(0, np.concatenate([into.ravel(), onto_outputs.ravel()])[:, None], column)
     # What multiplies the error of the state, and disturbances; remainders.
@@ -183,7 +183,7 @@ def mean_over_record(
 ) -> float:
     """Return the mean threshold over the tolerances on a record ``(steps, nu + ny)``, once the window is full."""
     thresholds = thresholds_over_tolerances(
-        over_the_box(noisy_as_bounded(window), window.question.disturbance),
+        over_the_box(noisy_as_bounded(window), window.test_problem.disturbance),
         observer,
         tracked(window, multipliers, T, T0),
         window.bounds.disturbance,

@@ -39,23 +39,23 @@ class Builder:
 
 
 def disturbance_columns(
-    bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int
+    bounds: Bounds, test_problem: TestProblem, builder: Builder, acting: Any, span: range, rows: int
 ) -> int:
     """Enter the disturbances over ``span``, and with a bounded rate one more row for each change; return how many rows
     there are then."""
     entry = np.ones((1, 1))
-    kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
+    kind = "d at samples" if bounds.moving is not None and test_problem.disturbance == "any" else "d"
     for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
         signal, bar = np.array([i]), bounds.disturbance[i]
         column = before = -1
         for k in span:
-            if question.disturbance != "held" or column < 0:
-                label = ("d", None if question.disturbance == "held" else k, i)
-                free = question.disturbance in ("any", "jump")
+            if test_problem.disturbance != "held" or column < 0:
+                label = ("d", None if test_problem.disturbance == "held" else k, i)
+                free = test_problem.disturbance in ("any", "jump")
                 column = builder.columns([label], [bar], 2 * k + 1 if free else -1)
             acting(kind, signal, k, column)
-            if question.disturbance == "rate" and before >= 0:
-                change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
+            if test_problem.disturbance == "rate" and before >= 0:
+                change = builder.columns([("change of d", k, i)], [test_problem.disturbance_rate[i]])
                 for place, times in ((column, 1), (before, -1), (change, -1)):
                     builder.put(rows, entry, place, times)
                 rows += 1
@@ -96,28 +96,28 @@ def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], Float
     return listed
 
 
-def fault_columns(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
+def fault_columns(test_problem: TestProblem, builder: Builder, acting: Any, span: range) -> None:
     """Enter the fault: its size at the target sample is column 0, others hold what its course leaves free."""
-    fault = np.array([question.fault])
-    target = question.samples - 1 - question.lag
-    if question.course in ("constant", "step"):
+    fault = np.array([test_problem.fault])
+    target = test_problem.samples - 1 - test_problem.lag
+    if test_problem.course in ("constant", "step"):
         for k in span:
-            if k >= question.before or question.course == "constant":
+            if k >= test_problem.before or test_problem.course == "constant":
                 acting("f", fault, k, 0)
-    elif question.course == "ramp":
-        slope = builder.columns([("slope", None, question.fault)], [np.inf])
+    elif test_problem.course == "ramp":
+        slope = builder.columns([("slope", None, test_problem.fault)], [np.inf])
         for k in span:
             acting("f", fault, k, 0)
             acting("f", fault, k, slope, k - target)
-    elif question.course == "any":
+    elif test_problem.course == "any":
         for k in span:
-            column = 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf])
+            column = 0 if k == target else builder.columns([("f", k, test_problem.fault)], [np.inf])
             acting("f", fault, k, column)
     else:
         for k in span:
             acting("f", fault, k, 0)
         for k in span[1:]:
-            change = builder.columns([("change of f", k, question.fault)], [question.fault_rate])
+            change = builder.columns([("change of f", k, test_problem.fault)], [test_problem.fault_rate])
             later = range(k, len(span)) if k > target else range(k)
             for later_sample in later:
                 acting("f", fault, later_sample, change, 1 if k > target else -1)

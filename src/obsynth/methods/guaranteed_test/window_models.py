@@ -109,10 +109,10 @@ def disturbance_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> 
     )
 
 
-def constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProblem) -> Model:
+def constant_model(plant: DescriptorSystem, bounds: Bounds, test_problem: TestProblem) -> Model:
     """Return the same matrices at each sample."""
     regular = decide_rank(plant.E).full
-    count = question.samples - 1 if regular else question.samples + question.closing
+    count = test_problem.samples - 1 if regular else test_problem.samples + test_problem.closing
     kinds = {
         "f": (plant.Bf, plant.Df),
         "d": (plant.Bd, plant.Dd),
@@ -120,9 +120,9 @@ def constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProble
         "d at samples": (plant.Bd * (1.0 if bounds.moving is None else ~bounds.moving.moved), plant.Dd),
         "w": (bounds.noise_state, bounds.noise_output),
     }
-    span = range(max(count, question.samples))
+    span = range(max(count, test_problem.samples))
     columns = {kind: [(k, *matrices) for k in span] for kind, matrices in kinds.items()}
-    return Model(plant, ((plant.E, plant.A, plant.B),) * count, (plant.C,) * question.samples, columns, regular)
+    return Model(plant, ((plant.E, plant.A, plant.B),) * count, (plant.C,) * test_problem.samples, columns, regular)
 
 
 def varying_model(plant: TimeVaryingDescriptorSystem, samples: int, start: int) -> Model:

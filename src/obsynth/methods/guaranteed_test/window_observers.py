@@ -14,11 +14,11 @@ from obsynth.observers.window.observer import WindowObserver
 
 def delay_in_samples(window: Window, delay: int) -> int:
     """Return after how many samples at the latest a fault of twice the threshold alarms."""
-    question = window.question
-    if question.course == "step":
-        return question.samples - 1 - question.before + delay
+    test_problem = window.test_problem
+    if test_problem.course == "step":
+        return test_problem.samples - 1 - test_problem.before + delay
     # The fault must have followed its course over the whole window; one of any time course needs only its own sample.
-    return (question.lag if question.course == "any" else question.samples - 1) + delay
+    return (test_problem.lag if test_problem.course == "any" else test_problem.samples - 1) + delay
 
 
 def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver | None = None) -> LinearObserver:
@@ -28,9 +28,9 @@ def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver 
     """
     on_y, on_u, delay = window.weights(multipliers)
     plant, count = window.plant, len(on_y) - 1
-    name = (plant.fault_names[window.question.fault],)
-    estimated = window.question.course != "step"
-    late = (window.question.lag + delay,) if estimated else ()
+    name = (plant.fault_names[window.test_problem.fault],)
+    estimated = window.test_problem.course != "step"
+    late = (window.test_problem.lag + delay,) if estimated else ()
     first = np.zeros((1, count))
     first[0, :1] = 1.0
     test = LinearObserver(
@@ -57,7 +57,7 @@ def observer_of_rows(
     problem: WindowProblem, programmes: WindowProgrammes, tested: np.ndarray, multipliers: list[FloatArray]
 ) -> WindowObserver:
     """Return the weights of all rows; ``tested``: which programmes have a test."""
-    plant, question = problem.plant, programmes.windows[0].question
+    plant, test_problem = problem.plant, programmes.windows[0].test_problem
     weights = []
     for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True):
         on_y, on_u, _ = window.weights(values)
@@ -67,19 +67,19 @@ def observer_of_rows(
         window.constant(values) if has_test else 0.0
         for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True)
     ]
-    estimated = question.course != "step"
+    estimated = test_problem.course != "step"
     name = (problem.fault,)
     return WindowObserver(
         weights=np.array(weights),
         programmes=np.where(tested[programmes.of_row], programmes.of_row, -1).astype(np.float64),
-        samples=question.samples,
+        samples=test_problem.samples,
         horizon=problem.horizon,
         dt=plant.dt,
         input_names=plant.input_names,
         output_names=plant.output_names,
         fault_names=name if estimated else (),
         residual_names=() if estimated else name,
-        fault_delays=(question.lag,) if estimated else (),
+        fault_delays=(test_problem.lag,) if estimated else (),
         constants=np.array(constants),
     )
 

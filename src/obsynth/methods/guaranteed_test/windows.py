@@ -54,7 +54,7 @@ SUM_ROOM = 1.01
 
 def disturbances_in_words(window: Window) -> str:
     """Return what is assumed of disturbances beside their bounds; empty where there are none."""
-    bounds, kind = window.bounds, window.question.disturbance
+    bounds, kind = window.bounds, window.test_problem.disturbance
     if not bounds.disturbance.any():
         return ""
     if bounds.moving is not None:
@@ -72,11 +72,11 @@ def disturbances_in_words(window: Window) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The stacked equations of a question; column 0 is theta."""
+    """The stacked equations of a test problem; column 0 is theta."""
 
     model: Model
     bounds: Bounds
-    question: TestProblem
+    test_problem: TestProblem
     rows: int
     labels: tuple[tuple[Any, ...], ...]
     bar: FloatArray
@@ -104,7 +104,7 @@ class Window:
     def plant(self) -> DescriptorSystem:
         """The plant of a window whose matrices do not change."""
         if not isinstance(self.model.plant, DescriptorSystem):
-            raise SpecError("This question is for plants whose matrices do not change with k.", path="plant")
+            raise SpecError("This test is for plants whose matrices do not change with k.", path="plant")
         return self.model.plant
 
     @property
@@ -118,7 +118,7 @@ class Window:
         The window's own columns are of disturbances that rest in each piece of a sample."""
         if self.bounds.moving is None or self.bounds.every:
             return self
-        outer = window_of(self.model.plant, replace(self.bounds, every=True), self.question)
+        outer = window_of(self.model.plant, replace(self.bounds, every=True), self.test_problem)
         lost = [label[2] for label in self.labels if label[0] == "missing"]
         return outer.without(np.array(lost, dtype=np.int64)) if lost else outer
 
@@ -129,7 +129,7 @@ class Window:
         return (
             outer
             if outer is self
-            else window_of(self.model.plant, replace(outer.bounds, times_rest=2.0), self.question)
+            else window_of(self.model.plant, replace(outer.bounds, times_rest=2.0), self.test_problem)
         )
 
     @cached_property
@@ -137,9 +137,9 @@ class Window:
         """The same rows for courses that disturbances may have for certain: a fault that these hide is hidden.
 
         Of a rate that is bounded those are of disturbances that are held between samples."""
-        if self.bounds.moving is None or self.question.disturbance == "any":
+        if self.bounds.moving is None or self.test_problem.disturbance == "any":
             return self
-        return window_of(self.model.plant, replace(self.bounds, moving=None), self.question)
+        return window_of(self.model.plant, replace(self.bounds, moving=None), self.test_problem)
 
     @property
     def moving_columns(self) -> list[tuple[tuple[str, int], FloatArray, float, int | None]]:
@@ -150,7 +150,7 @@ class Window:
     def replaced(self) -> list[int]:
         """Numbers of the disturbances whose values at the samples enter outputs alone."""
         moving = self.bounds.moving
-        if moving is None or self.question.disturbance != "any":
+        if moving is None or self.test_problem.disturbance != "any":
             return []
         return [int(i) for i in np.flatnonzero(moving.moved)]
 
@@ -227,12 +227,12 @@ class Window:
         _, ne, _, ny = self.model.sizes
         for kind, i, middle in middles:
             exact = Fraction(middle)
-            for k in range(max(self.equations, self.question.samples)):
+            for k in range(max(self.equations, self.test_problem.samples)):
                 equation, state, output = self.model.columns[kind][k]
                 if 0 <= equation < self.equations:
                     for row in np.flatnonzero(state[:, i]).tolist():
                         standing[equation * ne + row] -= exact * Fraction(float(state[row, i]))
-                if k < self.question.samples:
+                if k < self.test_problem.samples:
                     for row in np.flatnonzero(output[:, i]).tolist():
                         standing[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, i]))
         return tuple(standing)
@@ -254,20 +254,20 @@ class Window:
 
         ``multipliers (rows,)``: the test is their product with the right sides, at the last sample that has a weight.
         """
-        model, question = self.model, self.question
+        model, test_problem = self.model, self.test_problem
         _, ne, nu, ny = model.sizes
-        length = max(self.equations, question.samples)
+        length = max(self.equations, test_problem.samples)
         on_y, on_u = np.zeros((length, ny)), np.zeros((length, nu))
-        per_sample = multipliers[self.outputs_at : self.outputs_at + question.samples * ny]
-        on_y[: question.samples] = per_sample.reshape(-1, ny)
+        per_sample = multipliers[self.outputs_at : self.outputs_at + test_problem.samples * ny]
+        on_y[: test_problem.samples] = per_sample.reshape(-1, ny)
         equations = multipliers[: self.outputs_at].reshape(self.equations, ne)
         for k, part in enumerate(equations):
             on_u[k] += part @ model.equations[k][2]
         on_u -= on_y @ model.D
         # The equations after the last sample that are used have known inputs, and a state that they lead to.
-        later = np.flatnonzero(equations[question.samples :].any(axis=1))
+        later = np.flatnonzero(equations[test_problem.samples :].any(axis=1))
         delay = int(later[-1]) + 1 if later.size else 0
-        used = question.samples + delay
+        used = test_problem.samples + delay
         return on_y[:used][::-1].copy(), on_u[:used][::-1].copy(), delay
 
     def errors(self, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
@@ -285,7 +285,7 @@ class Window:
     def known_sizes(self, sizes: FloatArray) -> FloatArray:
         """Return what errors of multipliers of at most these sizes ``(rows,)`` do to known signals of one
         ``(nu + ny,)``."""
-        model, at, samples = self.model, self.outputs_at, self.question.samples
+        model, at, samples = self.model, self.outputs_at, self.test_problem.samples
         _, ne, nu, ny = model.sizes
         outputs = sizes[at : at + samples * ny].reshape(samples, ny).sum(axis=0)
         parts = zip(model.equations, sizes[:at].reshape(self.equations, ne), strict=True)
@@ -315,13 +315,13 @@ class Window:
 
 def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     """Return states, disturbances and faults of a point ``(columns,)`` over the samples of a window, by name."""
-    plant, question = window.model.plant, window.question
-    length = max(window.equations + 1, question.samples)
+    plant, test_problem = window.model.plant, window.test_problem
+    length = max(window.equations + 1, test_problem.samples)
     names = {"x": plant.state_names, "d": disturbance_names(plant), "f": fault_names(plant)}
     signals: dict[str, FloatArray] = {}
     own = np.zeros(length)
-    own[question.before :] = point[0]
-    signals[names["f"][question.fault]] = own
+    own[test_problem.before :] = point[0]
+    signals[names["f"][test_problem.fault]] = own
     for label, value in zip(window.labels, point, strict=True):
         if label[0] == "moving d" and window.bounds.moving is not None:
             # The mean over the sample.
@@ -331,29 +331,29 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
             signal = signals.setdefault(names[label[0]][label[2]], np.zeros(length))
             signal[slice(None) if label[1] is None else label[1]] = value
         elif label[0] == "slope":
-            own += value * (np.arange(length) - (question.samples - 1 - question.lag))
+            own += value * (np.arange(length) - (test_problem.samples - 1 - test_problem.lag))
         elif label[0] == "change of f":
-            target = question.samples - 1 - question.lag
+            target = test_problem.samples - 1 - test_problem.lag
             own[label[1] :] += value if label[1] > target else 0.0
             own[: label[1]] -= value if label[1] <= target else 0.0
-    if question.course == "any":
+    if test_problem.course == "any":
         # Column 0 is the sample that is reported, the others have columns of their own.
-        target = question.samples - 1 - question.lag
+        target = test_problem.samples - 1 - test_problem.lag
         own[np.arange(length) == target] = point[0]
-        own_samples = {label[1] for label in window.labels if label[0] == "f" and label[2] == question.fault}
+        own_samples = {label[1] for label in window.labels if label[0] == "f" and label[2] == test_problem.fault}
         own[[k for k in range(length) if k != target and k not in own_samples]] = 0.0
     return signals
 
 
 def window_of(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, bounds: Bounds, question: TestProblem, start: int = 1
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, bounds: Bounds, test_problem: TestProblem, start: int = 1
 ) -> Window:
-    """Return the stacked equations of a question; ``start``: k of the first sample, where matrices change with it."""
+    """Return the stacked equations of a test; ``start``: k of its first sample, where matrices change with it."""
     if isinstance(plant, DescriptorSystem):
-        model = constant_model(plant, bounds, question)
+        model = constant_model(plant, bounds, test_problem)
     else:
-        model = varying_model(plant, question.samples, start)
-    builder, samples = Builder(), question.samples
+        model = varying_model(plant, test_problem.samples, start)
+    builder, samples = Builder(), test_problem.samples
     equations = len(model.equations)
     nx, ne, _, ny = model.sizes
     rows = equations * ne + samples * ny
@@ -382,20 +382,20 @@ def window_of(
         if moving.size:
             column = builder.columns([("w", k, int(i)) for i in moving], bounds.noise[moving], 2 * k)
             acting("w", moving, k, column)
-    rows = disturbance_columns(bounds, question, builder, acting, range(max(equations, samples)), rows)
+    rows = disturbance_columns(bounds, test_problem, builder, acting, range(max(equations, samples)), rows)
     moving_disturbances(bounds, builder, equations, ne)
-    fault_columns(question, builder, acting, span)
-    for fault in question.free:
+    fault_columns(test_problem, builder, acting, span)
+    for fault in test_problem.free:
         column = -1
         for k in span:
-            if question.free_course == "any" or column < 0:
-                column = builder.columns([("f", k if question.free_course == "any" else None, fault)], [np.inf])
+            if test_problem.free_course == "any" or column < 0:
+                column = builder.columns([("f", k if test_problem.free_course == "any" else None, fault)], [np.inf])
             acting("f", np.array([fault]), k, column)
     entries = [np.concatenate(parts) for parts in zip(*builder.parts, strict=True)]
     return Window(
         model,
         bounds,
-        question,
+        test_problem,
         rows,
         tuple(builder.labels),
         np.array(builder.bar),

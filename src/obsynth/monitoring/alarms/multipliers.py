@@ -70,7 +70,7 @@ def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArr
     bounded = np.flatnonzero(window.bounded).tolist()
     parts = [Fraction(float(window.bar[j])) * abs(combined[j]) for j in bounded]
     allowed = sum(parts, start=Fraction(0))
-    if window.question.ellipsoid:
+    if window.test_problem.ellipsoid:
         allowed = Fraction(sum_in_ellipsoids(window, parts))
     if allowed == 0:
         # No disturbance and no noise at all: the rounding of the samples themselves would be a proof.
@@ -83,9 +83,9 @@ def statement_of(
 ) -> str:
     """Return what a proof says, with everything it rests on."""
     window = Programmes.of(test).window
-    plant, question = window.plant, window.question
+    plant, test_problem = window.plant, window.test_problem
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
-    free_faults = [plant.fault_names[k] for k in question.free]
+    free_faults = [plant.fault_names[k] for k in test_problem.free]
     besides = f", whatever {' and '.join(free_faults)} does" if free_faults else ""
     fault, bounds = " or ".join(group), window.bounds
     noise = np.abs(bounds.noise_output) @ bounds.noise

@@ -37,6 +37,9 @@ SWEEP_HEIGHT = 4.2
 #: A ratio of the largest to the smallest value above which an axis is logarithmic.
 LOGARITHMIC = 100.0
 
+#: Share of its height that an axis has above the largest value.
+EDGE_MARGIN = 0.1
+
 #: Markers of lines, in turn, and of cases without a design, by what they came to.
 MARKERS = "osD^vP*Xh"
 
@@ -162,8 +165,12 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     if filter_.non_causal_limit > 0.0:
         panel.axhline(filter_.non_causal_limit, color="0.5", linestyle="--", label="gain that no delay falls below")
     panel.set_xticks(delays)
+    # A line at the upper edge would be taken for the frame.
+    panel.margins(y=EDGE_MARGIN)
     panel.set_ylim(bottom=0.0)
-    return finish(panel, "error per unit of noise", below="delay of the fault map (samples)")
+    units = {design.plant.units.get(name, "1") for name in design.observer.fault_names}
+    unit = f"{units.pop()} per unit of noise" if len(units) == 1 and units != {"1"} else "per unit of noise"
+    return finish(panel, f"error of the fault estimates\n({unit})", below="delay of the fault map (samples)")
 
 
 def draw_region_trade_off(
