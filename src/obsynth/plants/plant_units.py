@@ -27,6 +27,9 @@ SIGNALS_WEIGHT = 1e-3
 #: A step that changes an entry by less than this share of it may be rounding of the entry.
 STEP_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
+#: A plant whose states change by less than this share in a sample is not sampled fast: its links are far apart.
+LEAST_STEP = 1e-5
+
 #: Exponents of integer plants are often half of a whole number, which rounding would take up or down by chance.
 OFF_THE_TIES = 1e-3
 
@@ -218,7 +221,8 @@ def _units_of(plant: DescriptorSystem) -> tuple[PlantUnits, bool]:
     units = PlantUnits._balanced(plant, None)
     if plant.is_discrete:
         by_steps = PlantUnits._balanced(plant, None, by_steps=True)
-        if units.apart(by_steps) > FAR_UNITS:
+        steps = by_steps.equations[:, None] * step_change(plant.E, plant.A) * by_steps.states
+        if moves_by_steps(steps[plant.E.any(axis=1)]) and units.apart(by_steps) > FAR_UNITS:
             return by_steps, True
     return units, False
 
@@ -227,6 +231,12 @@ def step_change(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return ``after - before``, without what is only their rounding."""
     change = after - before
     return np.where(np.abs(change) > STEP_ROUNDING * np.abs(before), change, 0.0)
+
+
+def moves_by_steps(steps: FloatArray) -> bool:
+    """Return whether what a step changes, in units in which all of it is alike, is a share of the states that a
+    sampling time would make of them."""
+    return bool(np.max(np.abs(steps), initial=0.0) > LEAST_STEP)
 
 
 def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:

@@ -304,13 +304,16 @@ class ErrorModel:
         )
 
     @cached_property
+    def _scaling(self) -> Scaling:
+        """Natural units of xa, and of the equations that it follows."""
+        if self.lag or self.Phi is not None:
+            return balance_by_least_squares(self.E, self.A, outputs=[self.C])
+        return natural_scaling(self.plant)
+
+    @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Natural units of xa ``(na,)``, and in these the largest terms of each row of z and of the outputs."""
-        size, observer = np.abs, self.observer
-        if self.lag or self.Phi is not None:
-            units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
-        else:
-            units = natural_scaling(self.plant).states
+        size, observer, units = np.abs, self.observer, self._scaling.states
         te, c = size(self.T) @ size(self.E), size(self.C)
         formed = size(observer.Az) @ te + size(observer.By) @ c + size(self.T) @ size(self.A)
         estimates = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
@@ -340,13 +343,21 @@ class ErrorModel:
             float(np.max(size(balls.midpoint) * units / terms, initial=0.0))
             for balls, terms in zip((channel.K, channel.J), rows, strict=True)
         ]
-        for balls, terms in (((channel.U, channel.L), inputs), ((channel.W, channel.V), disturbances)):
+        # T holds no more digits of an equation than of the row's largest one.
+        equations = self._scaling.equations
+        row_of_t = np.max(t / equations, axis=1, initial=0.0, keepdims=True) / rows[0]
+        for balls, terms, b in (
+            ((channel.U, channel.L), inputs, self.B),
+            ((channel.W, channel.V), disturbances, self.Bd),
+        ):
             # Each signal in the unit in which it moves some row by its largest terms.
             missed, moved = (
                 np.vstack([part / row for part, row in zip(parts, rows, strict=True)])
                 for parts in ([size(part.midpoint) for part in balls], terms)
             )
-            scale = np.max(moved, axis=0, initial=0.0)
+            signal = np.max(size(b) * equations[:, None], axis=0, initial=0.0)
+            possible = np.max(row_of_t, initial=0.0) * signal
+            scale = np.maximum(np.max(moved, axis=0, initial=0.0), LEAST_ROW * possible)
             shares.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))
         if self.T0 is not None:
             largest = np.max(t0 @ size(self.E) * units, axis=1, initial=0.0, keepdims=True)

@@ -17,7 +17,7 @@ from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.staircase import full_svd
-from obsynth.plants.plant_units import FAR_UNITS, step_change
+from obsynth.plants.plant_units import FAR_UNITS, moves_by_steps, step_change
 
 #: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
 BY_LEAST_SQUARES = 40
@@ -40,9 +40,11 @@ class PencilUnits:
         if sampled and A.size:
             change = step_change(E, A)
             by_steps = cls._balanced(E, change)
-            if float(np.ptp(np.log2(by_steps.columns) - np.log2(units.columns))) > np.log2(FAR_UNITS):
-                moving = E.any(axis=1)
-                return cls(np.where(moving, by_steps.rows * by_steps.time, by_steps.rows), by_steps.columns, 1.0)
+            moving = E.any(axis=1)
+            rows = np.where(moving, by_steps.rows * by_steps.time, by_steps.rows)
+            apart = float(np.ptp(np.log2(by_steps.columns) - np.log2(units.columns)))
+            if moves_by_steps((rows[:, None] * change * by_steps.columns)[moving]) and apart > np.log2(FAR_UNITS):
+                return cls(rows, by_steps.columns, 1.0)
         return units
 
     @classmethod

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.ranks import NEARLY_DEPENDENT, but_rounding, rounding_rank
+from obsynth.numerics.ranks import NEARLY_DEPENDENT, but_rounding, product_but_rounding, rounding_rank
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -84,10 +84,11 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
         return None
     picked = [int(moving[place]) for place in _most_independent(units, count)]
     combinations = np.linalg.lstsq((scaled[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
+    combinations = but_rounding(combinations, np.ones_like(combinations))
     q = np.zeros((len(scaled), count))
     q[moving] = combinations * lengths[moving, None] / lengths[picked]
     weights = _weights(q, own.outputs[:, None] * plant.Dw) * own.outputs / own.outputs[picked, None]
-    merged = {name: weights @ getattr(plant, name) for name in ("C", "D", "Df", "Dd", "Dw")}
+    merged = {name: product_but_rounding(weights, getattr(plant, name)) for name in ("C", "D", "Df", "Dd", "Dw")}
     names = [plant.output_names[i] for i in picked]
     return MergedOutputs(plant.replace(**merged, output_names=names), read_only(weights), False)
 
@@ -137,10 +138,14 @@ def _most_independent(units: FloatArray, count: int) -> list[int]:
 
 
 def _weights(q: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return M of outputs whose noise has the columns ``noise (ny, nw)``."""
+    """Return M of outputs whose noise has the columns ``noise (ny, nw)``; weights that are rounding are none: plants
+    side by side would be joined by them."""
     covariance = noise @ noise.T
     largest = float(np.max(np.diag(covariance), initial=0.0))
     covariance = covariance + LEAST_NOISE_SHARE**2 * largest * np.eye(len(q)) if largest > 0.0 else np.eye(len(q))
     factor = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(factor, q)
-    return np.asarray(np.linalg.lstsq(whitened, np.linalg.solve(factor, np.eye(len(q))), rcond=None)[0])
+    weights = np.asarray(np.linalg.lstsq(whitened, np.linalg.solve(factor, np.eye(len(q))), rcond=None)[0])
+    deviations = np.sqrt(np.diag(covariance))
+    largest_of_row = np.max(np.abs(weights) * deviations, axis=1, initial=0.0, keepdims=True)
+    return but_rounding(weights, largest_of_row / deviations)
