@@ -11,6 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.observers.linear.modes import checked_warm_up, transient
+from obsynth.observers.scheduled.observer import ScheduledObserver
 
 #: What the statistic of a monitor is called, in units of its level.
 STATISTIC = "statistic"
@@ -99,6 +100,18 @@ class Alarms:
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor in C, if there is one."""
         return "" if self.monitor is None else self.monitor.source(prefix)
+
+
+def scheduled_alarms(
+    observer: ScheduledObserver,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    monitor: ExportedMonitor | None,
+) -> Alarms:
+    """Return the alarms of a scheduled observer in discrete time."""
+    columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
+    seconds = checked_warm_up(warm_up, observer.forgetting * observer.dt)
+    return Alarms.of(columns, observer.fault_names, thresholds, seconds, monitor)
 
 
 def linear_alarms(

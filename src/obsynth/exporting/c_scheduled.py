@@ -8,9 +8,20 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import comment, filled_template, included, quoted, signal_comments, table_lines
+from obsynth.exporting.alarms import Alarms
+from obsynth.exporting.c_source import (
+    alarm_comments,
+    comment,
+    filled_table,
+    filled_template,
+    included,
+    quoted,
+    signal_comments,
+    table_lines,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import Expression, step_function
+from obsynth.observers.linear.modes import SETTLING_SLACK
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.scheduling import WEIGHT_TOLERANCE
 from obsynth.results.design import ObserverDesign, unverified_mark
@@ -18,6 +29,8 @@ from obsynth.results.gain_set_writing import gain_set_digest
 
 #: A known input counts as it last was where it is missing.
 _TAKEN = "if (isfinite(u[i])) {\n            s->u[i] = u[i];\n        } else {\n            whole = 0;\n        }"
+#: Rows of a warm-up at most: whole numbers of C reach as far.
+MOST_ROWS = 1e9
 #: What a row is called.
 STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "OUT")
 
@@ -50,7 +63,7 @@ _C_FUNCTIONS: dict[Callable[..., Any], str] = {
 }
 
 
-def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str]:
+def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms) -> tuple[str, str]:
     """Return source and header."""
     plant, observer = design.scheduled
     nu, ny, digest = observer.inputs, len(observer.output_names), gain_set_digest(design)
@@ -60,6 +73,7 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple
     declared = [
         comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth."),
         *([comment(quoted(mark))] if mark else []),
+        *(comment(line) for line in alarm_comments(alarms)),
         f"#ifndef {upper}_H",
         f"#define {upper}_H",
         "",
@@ -68,14 +82,23 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple
         comment("seconds between samples; rows without a claim after one outside the region"),
         f"#define {upper}_DT {observer.dt!r}",
         f"#define {upper}_FORGETTING {observer.forgetting}",
+        comment("outputs that may be watched"),
+        f"#define {upper}_WATCHED {len(alarms.levels)}",
         "",
         comment(f"The region: {quoted(plant.scheduling.sentence())}"),
         comment("OUT: a parameter is missing, outside its range or too fast, or was so until recently: no claim."),
         f"enum {{ {listed} }};",
         "",
+        *alarms.struct_lines(prefix),
         "typedef struct {",
-        comment("Read this after a step: what the row was."),
+        comment("Read these after a step: what the row was, and which outputs passed their levels (if OK)."),
         "    int status;",
+        f"    int alarm[{max(len(alarms.levels), 1)}];",
+        "    int any_alarm;",
+        comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
+        f"    REAL level[{max(len(alarms.levels), 1)}];",
+        "    double warm_up;",
+        *([] if alarms.monitor is None else [f"    {prefix}_monitor monitor;"]),
         comment("Everything else is the observer's own."),
         f"    REAL z[{max(observer.order, 1)}], weights[{observer.count}];",
         f"    REAL parameters[{len(observer.scheduling.names)}];",
@@ -97,10 +120,10 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple
         "",
         "#endif",
     ]
-    return _source(design, prefix, header, digest), "\n".join(declared) + "\n"
+    return _source(design, prefix, header, digest, alarms), "\n".join(declared) + "\n"
 
 
-def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> str:
+def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarms: Alarms) -> str:
     _, observer = design.scheduled
     held, nu = observer.scheduling, observer.inputs
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
@@ -121,6 +144,8 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "FAULT_COUNT": nf,
         "DIVIDES": int(not observer.effectiveness_is_one),
         "CORRECTS": int(observer.correction is not None),
+        "MONITORS": int(alarms.monitor is not None),
+        "WATCHED": len(alarms.levels),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }
     groups = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
@@ -146,10 +171,15 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
         *(f"#define {name} {size}" for name, size in defined.items()),
         f"#define WEIGHT_TOLERANCE {WEIGHT_TOLERANCE!r}",
+        f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
+        f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
+        f"#define MOST_ROWS {MOST_ROWS!r}",
         "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
         "",
         *(line for name, table in _tables(observer).items() for line in table_lines(name, table)),
+        *table_lines("levels", filled_table(np.array([list(alarms.levels.values())]))),
         "",
+        alarms.source(prefix),
         body,
     ]
     return "\n".join(lines)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import Alarms, ExportedMonitor, Monitor, linear_alarms
+from obsynth.exporting.alarms import Alarms, ExportedMonitor, Monitor, linear_alarms, scheduled_alarms
 from obsynth.exporting.c_scheduled import scheduled_c_texts
 from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
 from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
@@ -106,7 +106,8 @@ def export(
     monitor : Monitor, optional
         From `online_monitor`: one that was learned from rows without faults (``"learned"``; its statistic and alarms
         are those of a run), for ``.c`` and ``.fmu``; or with ``constants``, its thresholds over the tolerances as
-        ``<stem>_thresholds_step``, for constants that stay the same; for ``.c`` only.
+        ``<stem>_thresholds_step``, for constants that stay the same; for ``.c`` only.  Of a design over a region in
+        discrete time its guaranteed threshold (``"pointwise"``), for ``.c``.
     precision : {"double", "float"}, optional
         Of the numbers in C; the header of floats bounds what these change for linear observers, and says what was
         measured for nonlinear ones (which takes a C compiler).
@@ -272,14 +273,16 @@ def _write_scheduled(
             "logs (obsynth.run_on_data), and C is written of those for plants in discrete time (dt).",
             path="path",
         )
-    if monitor is not None or thresholds or warm_up is not None or sample_time is not None or numbers != "double":
+    if sample_time is not None or numbers != "double":
         raise SpecError(
-            "C of a design over a region holds the observer alone, in doubles: leave monitor, thresholds, warm-up, "
-            "sample time and precision out.",
-            path="monitor",
+            "C of a design over a region is in doubles, at the sample time of its plant: leave sample_time and "
+            "precision out.",
+            path="precision" if sample_time is None else "sample_time",
         )
+    written = None if monitor is None else registered("monitor_in_c")(monitor, design)
+    alarms = scheduled_alarms(design.scheduled[1], thresholds, warm_up, written)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declared = (in_precision(text, numbers) for text in scheduled_c_texts(design, prefix, header.name))
+    source, declared = (in_precision(text, numbers) for text in scheduled_c_texts(design, prefix, header.name, alarms))
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 

@@ -1,4 +1,5 @@
-"""Monitors in exported files: learned thresholds as C beside their observer, and bounds over tolerances."""
+"""Monitors in exported files: learned thresholds and bounds over a region as C beside their observer, and bounds over
+tolerances."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
+from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.monitoring.thresholds.watched_columns import as_learned, watched_names
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
@@ -159,8 +162,73 @@ class LearnedMonitorInC:
         return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
 
 
-def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC | None:
-    """Return what a monitor has learned, of this design, as C; ``None`` where it is of another kind."""
+@dataclass(frozen=True, eq=False)
+class RegionMonitorInC:
+    """A bound on the residual for every course of the parameters as C: an `obsynth.exporting.alarms.ExportedMonitor`.
+
+    ``table``: bounds by the row since the start; ``limit``: for ever after; ``fault_scales (nf,)``: what fault
+    estimates are compared in.
+    """
+
+    statement: str
+    table: FloatArray
+    limit: float
+    residuals: int
+    fault_names: tuple[str, ...]
+    fault_scales: FloatArray
+
+    @property
+    def variables(self) -> tuple[MonitorVariable, ...]:
+        """The norm of the residual in units of its threshold, and the fault that an alarm points to."""
+        listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(self.fault_names))
+        return (
+            MonitorVariable(STATISTIC, f"norm of the residual by its threshold: {self.statement}", "statistic"),
+            MonitorVariable(
+                "isolated",
+                f"number of the fault of the plant that an alarm points to, 0 for none ({listed})",
+                "fault + 1.0",
+            ),
+        )
+
+    def watched_observer(self, observer: Any) -> Any:
+        """Return the observer as it is."""
+        return observer
+
+    def struct_lines(self, prefix: str) -> list[str]:
+        """Return the declaration of the monitor's structure."""
+        return [
+            "typedef struct {",
+            "    /* Read these after a step: the norm of the residual in units of its threshold, both of them,",
+            "     * NaN where nothing is decided; whether the threshold is passed, and by which fault (-1: none). */",
+            "    REAL statistic, norm, threshold;",
+            "    int alarm, fault;",
+            "    /* Everything else is the monitor's own. */",
+            "    int is_decided;",
+            "    long row;",
+            f"}} {prefix}_monitor;",
+            "",
+        ]
+
+    def source(self, prefix: str) -> str:
+        """Return the tables and functions of the monitor."""
+        sizes = {
+            "TABLE_LENGTH": len(self.table),
+            "MONITOR_RESIDUALS": self.residuals,
+            "MONITOR_FAULTS": len(self.fault_names),
+        }
+        lines = [
+            f"enum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
+            f"#define MONITOR_LIMIT ((REAL){self.limit!r})",
+            *table_lines("monitor_table", filled_table(self.table[None])),
+            *table_lines("monitor_scales", filled_table(self.fault_scales[None])),
+        ]
+        return "\n".join(lines) + filled_template("region_threshold.c", prefix, {}, "obsynth.monitoring")
+
+
+def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC | RegionMonitorInC | None:
+    """Return a monitor of this design as C; ``None`` where it is of a kind that is written otherwise, or not."""
+    if isinstance(design.observer, ScheduledObserver):
+        return _region_monitor(monitor, design.observer)
     if not isinstance(monitor.rule, LearnedRule):
         return None
     learned = monitor.rule.learned
@@ -178,6 +246,21 @@ def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC 
         tuple(design.observer.fault_names),
         parameter_walk(design.observer),
         len(design.plant.output_names),
+    )
+
+
+def _region_monitor(monitor: Monitor, observer: ScheduledObserver) -> RegionMonitorInC:
+    monitor.require_fit(len(observer.residual_names), observer.fault_names)
+    bound = monitor.rule.bound_by_row if isinstance(monitor.rule, NormRule) else None
+    if monitor.kind != "pointwise" or bound is None:
+        raise SpecError(
+            "C of a design over a region holds guaranteed thresholds (kind 'pointwise' of obsynth.online_monitor) and "
+            "levels of its outputs, not this monitor: run it on rows with obsynth.run_on_data.",
+            path="monitor",
+        )
+    table, limit = bound
+    return RegionMonitorInC(
+        monitor.statement, table, float(limit), monitor.residuals, monitor.fault_names, monitor.fault_scales
     )
 
 

@@ -21,6 +21,34 @@ void PREFIX_reset(PREFIX_state *s)
     s->settling = 0;
     s->is_started = 0;
     s->is_recovering = 0;
+    s->warm_up = WARM_UP_SECONDS;
+    s->any_alarm = 0;
+    for (i = 0; i < LENGTH(WATCHED); i++) {
+        s->level[i] = levels[0][i];
+        s->alarm[i] = 0;
+    }
+#if MONITORS
+    monitor_reset(&s->monitor);
+#endif
+}
+
+/* After a row with its status: which outputs passed their levels. */
+static void watch(PREFIX_state *s, const REAL *shown)
+{
+    int i;
+    s->any_alarm = 0;
+#if MONITORS
+    monitor_take(&s->monitor, s->status == UPPER_OK, shown, shown + FAULT_COUNT);
+#endif
+    for (i = 0; i < WATCHED; i++) {
+#if MONITORS
+        const REAL value = i == WATCHED - 1 ? s->monitor.statistic : shown[i];
+#else
+        const REAL value = shown[i];
+#endif
+        s->alarm[i] = s->status == UPPER_OK && s->level[i] > 0 && fabs(value) > s->level[i];
+        s->any_alarm = s->any_alarm || s->alarm[i];
+    }
 }
 
 /* The sum over the vertices of weights times matrices times a vector is added to `sum`. */
@@ -165,11 +193,12 @@ int PREFIX_step(STEP_ARGUMENTS)
         }
         COPY_ROWS
         s->status = UPPER_GAP;
+        watch(s, rows + STATE_COUNT);
         return 1;
     }
     if (!s->is_started) {
         s->is_started = 1;
-        s->settling = FORGETTING;
+        s->settling = (int)fmin(fmax(ceil(s->warm_up / UPPER_DT - SETTLING_SLACK), 0), MOST_ROWS);
     }
     {
         const int inside = scheduling_of(s, u + U_COUNT, weights);
@@ -210,7 +239,6 @@ int PREFIX_step(STEP_ARGUMENTS)
             rows[i] = NAN;
         }
         if (s->settling <= FORGETTING) {
-            s->is_recovering = s->is_recovering || s->settling <= 0;
             s->settling = FORGETTING;
         }
     }
@@ -226,5 +254,6 @@ int PREFIX_step(STEP_ARGUMENTS)
         s->status = UPPER_OK;
     }
     s->settling = s->settling > 0 ? s->settling - 1 : 0;
+    watch(s, rows + STATE_COUNT);
     return s->status == UPPER_OK ? 0 : 1;
 }

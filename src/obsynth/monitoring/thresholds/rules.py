@@ -80,6 +80,14 @@ class NormRule(Rule):
         self._regular = table, limit
         self._window, self._dt, self._watched, self._driven = window, dt, watched, driven
 
+    @property
+    def bound_by_row(self) -> UnlimitedHorizonBound | None:
+        """Bounds on the norm of one residual by the row since the start, and for ever after; ``None`` where a threshold
+        depends on more than the row."""
+        more = (self.gaps, self.irregular, self._watched, self._driven)
+        plain = self._window == 1 and all(part is None for part in more)
+        return self._regular if plain else None
+
     def over_gaps(self, gaps: GapGrowth) -> NormRule:
         """Return the rule that knows what missing outputs add after them: it need not wait until their effect has
         settled."""
