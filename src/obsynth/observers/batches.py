@@ -41,14 +41,16 @@ def run_dae_batch(
     """Run many trials; see `obsynth.run_batch` (``y (trials, samples, ny)``)."""
     outputs, inputs = batch_record(y, u, observer.model.ny, observer.model.input_names)
     trials, samples = outputs.shape[:2]
-    alone = observer.outside_graph
-    if alone and compiled:
-        raise SpecError(f"The C code has no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
-    if compiled is None and not alone:
+    not_in_c = observer.outside_graph
+    if not_in_c and compiled:
+        raise SpecError(
+            f"The C code has no {not_in_c}: leave compiled=True out, or leave {not_in_c} out.", path="compiled"
+        )
+    if compiled is None and not not_in_c:
         compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
-    take = _in_c if compiled else _in_casadi
+    run_trials = _in_c if compiled else _in_casadi
     with shown_progress(progress, trials, "trials") as note:
-        parts = take(observer, outputs, inputs, note)
+        parts = run_trials(observer, outputs, inputs, note)
     received = ~np.isnan(outputs)
     return named_estimates(
         observer,
@@ -68,6 +70,7 @@ def _of_trial(inputs: FloatArray, trials: slice | int) -> FloatArray:
 
 
 def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]) -> dict[str, FloatArray]:
+    """Return the records of all trials, run by the compiled library in chunks."""
     library, begin = observer.library, 0
     chunks: list[dict[str, FloatArray]] = []
     while begin < len(y):
@@ -76,8 +79,8 @@ def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[i
         chunks.append({name: part[:taken] for name, part in parts.items()})
         begin += taken
         if begin < trials.stop:
-            # The message is written there.
-            chunks.append({name: part[None] for name, part in _one(observer, y, u, begin).items()})
+            # The C code stopped at this trial: run step by step it ends the same way, with a message.
+            chunks.append({name: part[None] for name, part in _trial_alone(observer, y, u, begin).items()})
             begin += 1
         note(begin)
     return {name: np.concatenate([parts[name] for parts in chunks]) for name in BATCH_PARTS}
@@ -88,12 +91,13 @@ def _in_casadi(
 ) -> dict[str, FloatArray]:
     trials_of_parts = []
     for trial in range(len(y)):
-        trials_of_parts.append(_one(observer, y, u, trial))
+        trials_of_parts.append(_trial_alone(observer, y, u, trial))
         note(trial + 1)
     return {name: np.array([parts[name] for parts in trials_of_parts]) for name in BATCH_PARTS}
 
 
-def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
+def _trial_alone(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
+    """Return the record of one trial, run step by step; a `SolverError` names the trial."""
     rows: list[DAERow] = []
     try:
         if observer.outside_graph:

@@ -53,8 +53,8 @@ FAMILY_TOLERANCE = 1e-9
 
 STORED_TWICE = "the gain set: what is stored twice is compared"
 
-#: What both plants say of the signals that neither elimination nor sampling touches.
-_KEPT_NAMES = tuple(name for name in SIGNAL_NAMES if name not in ("state_names", "noise_names"))
+#: Names of signals that neither elimination nor sampling touches: both plants have the same.
+_SHARED_NAMES = tuple(name for name in SIGNAL_NAMES if name not in ("state_names", "noise_names"))
 
 
 def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
@@ -202,7 +202,7 @@ def relative_difference(one: FloatArray, other: FloatArray, radius: FloatArray |
 def _sampling_rows(
     smooth: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, model: ErrorModel
 ) -> Iterator[Check]:
-    """Yield what the hold has to do with gains and delays, and the gain over disturbances of any time course."""
+    """Yield what the hold between samples means for delays, and the gain over disturbances of any time course."""
     delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
     yield information(
         "sampling: delay",
@@ -247,6 +247,9 @@ def _sampling_rows(
 def _peak_gain(
     smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
 ) -> float:
+    """Return the largest fault error for ``|d(t)| <= 1`` at all times; NaN where no contraction is proved.
+
+    ``t``: from errors of the plant's states to those of the observer's; ``direct``: of the disturbances at a sample."""
     contraction = contraction_of(observer)
     if contraction is None:
         return np.nan
@@ -273,8 +276,8 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
         if tuple(getattr(observer, name)) != tuple(getattr(plant, name))
     ]
     if source is not None:
-        wrong += [f"{name} as written" for name in _KEPT_NAMES if getattr(source.plant, name) != getattr(plant, name)]
-        signals = {name for field in _KEPT_NAMES for name in getattr(plant, field)}
+        wrong += [f"{name} as written" for name in _SHARED_NAMES if getattr(source.plant, name) != getattr(plant, name)]
+        signals = {name for field in _SHARED_NAMES for name in getattr(plant, field)}
         signals |= set(plant.state_names) & set(source.plant.state_names)
         for label in ("units", "scales", "operating_point"):
             one, other = getattr(source.plant, label), getattr(plant, label)
@@ -282,7 +285,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
                 wrong.append(f"{label} as written")
         if plant.dt != (source.plant.dt if source.sample_time is None else source.sample_time):
             wrong.append("sample time")
-        wrong += _noise_of(source, plant)
+        wrong += _wrong_noise(source, plant)
     if source is None and not wrong:
         return
     yield nothing_wrong(
@@ -293,7 +296,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
     )
 
 
-def _noise_of(source: PlantSource, plant: DescriptorSystem) -> list[str]:
+def _wrong_noise(source: PlantSource, plant: DescriptorSystem) -> list[str]:
     """Return covariances of the noise that do not follow from the plant as written: factors are not unique."""
     try:
         made = source.derived.plant

@@ -57,7 +57,8 @@ class ExactDecoupledFault(DecoupledFault):
         a, c, right, outputs = self.removal.reduction
         nf = self.source.nf
         known_columns = range(nf, right.ncols())
-        parts = (picked_columns(part, of) for of in ([self.number], known_columns) for part in (right, outputs))
+        groups = ([self.number], known_columns)
+        parts = (picked_columns(part, columns) for columns in groups for part in (right, outputs))
         return a, c, *parts
 
     @cached_property
@@ -144,7 +145,7 @@ class ExactDecoupledFault(DecoupledFault):
 
 
 def decided_exactly(plant: DescriptorSystem) -> bool:
-    """Whether a plant is small enough, and made of numbers as they were written."""
+    """Whether a plant is small enough to be decided over the rational numbers, and its numbers are as written."""
     matrices = (plant.E, plant.A, plant.C, plant.Bd, plant.Dd, plant.Bf, plant.Df)
     return plant.nx + plant.nd + plant.nf <= MOST_EXACT_UNKNOWNS and not any(map(holds_computed, matrices))
 
@@ -152,13 +153,13 @@ def decided_exactly(plant: DescriptorSystem) -> bool:
 def decoupled_fault(
     plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None
 ) -> DecoupledFault:
-    r"""Return a fault with others out of sight; exact \(unless it is said\) where the plant is decided exactly."""
+    """Return a fault with others removed; ``exactly``: over the rational numbers, by default where that is possible."""
     return DecoupledFaults(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
 
 
 @dataclass(frozen=True, eq=False)
 class DecoupledFaults:
-    """The faults of one plant: what several of them rest on is computed once."""
+    """The faults of one plant; reductions that several of them share are computed once."""
 
     source: DescriptorSystem
     exactly: bool
@@ -168,14 +169,14 @@ class DecoupledFaults:
 
     def of(self, removed: Sequence[int], number: int) -> DecoupledFault:
         """Return a fault, with others removed."""
-        gone = tuple(sorted(removed))
-        if (gone, number) not in self._faults:
-            if gone not in self._removals:
-                self._removals[gone] = Removal(self.source, gone, self._pencils)
-            removal, small = self._removals[gone], self.source.nx + self.source.ny <= MOST_REDUCED
+        removed_faults = tuple(sorted(removed))
+        if (removed_faults, number) not in self._faults:
+            if removed_faults not in self._removals:
+                self._removals[removed_faults] = Removal(self.source, removed_faults, self._pencils)
+            removal, small = self._removals[removed_faults], self.source.nx + self.source.ny <= MOST_REDUCED
             exact = ExactDecoupledFault(removal, number, small) if self.exactly else None
-            self._faults[gone, number] = exact or DecoupledFault(removal, number)
-        return self._faults[gone, number]
+            self._faults[removed_faults, number] = exact or DecoupledFault(removal, number)
+        return self._faults[removed_faults, number]
 
 
 def _is_zero(matrix: fmpq_mat) -> bool:

@@ -51,10 +51,10 @@ class DescriptorKalman(Method):
         Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
         which `step` has; Q must not couple them with the others.
     outliers : {"none", "gate", "huber"}, optional
-        By default none; only a run on data, and a C or FMU file of a nonlinear design, then has a gate.  What is stated
-        is the rule everywhere.
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
-        of one sensor; or taken at the limit (Huber's weight).
+        What is done with a sample that its prediction excludes: taken as it is (``none``); left out, at most twice in a
+        row of one sensor (``gate``); or taken at the limit (``huber``, Huber's weight).  By default samples are taken
+        as they are, but for a run on data, and a C or FMU file of a nonlinear design, which have a gate.  An option
+        that is stated holds everywhere.
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     outlier_sizes : array_like or mapping, optional

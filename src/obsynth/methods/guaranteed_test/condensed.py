@@ -56,13 +56,14 @@ def _distance_from(matrix: Any, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """A window whose states follow from the first one."""
+    """A window in which the first state and the signals determine all later states: E is nonsingular."""
 
     window: Window
 
     @classmethod
     def of(cls, window: Window) -> Condensed | None:
-        """Return it, or ``None`` where the window is small or has not this structure."""
+        """Return the window in this form; ``None`` where it is small, or where E is singular, states are bounded, or
+        equations reach beyond the samples."""
         if window.rows < FEWEST_ROWS or not isinstance(window.model.plant, DescriptorSystem):
             return None
         plant, samples = window.plant, window.test_problem.samples
@@ -84,7 +85,7 @@ class Condensed:
 
     @cached_property
     def _columns_beside_states(self) -> np.ndarray:
-        """Columns that are no states."""
+        """Columns of the window that multiply anything but states."""
         return np.array([k for k, label in enumerate(self.window.labels) if label[0] != "x"])
 
     def _parts(self, columns: np.ndarray) -> tuple[list[FloatArray], list[FloatArray]]:
@@ -119,7 +120,7 @@ class Condensed:
         count = responses.ncols()
         target = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
         try:
-            # Far states of a network show so little that double precision has no say in it.
+            # Distant states of a network are so hard to observe that double precision would lose them.
             weights = responses * (responses.transpose() * responses).solve(target)
         except ZeroDivisionError:
             return None
@@ -226,13 +227,14 @@ class Condensed:
     def _noise_columns(self) -> np.ndarray:
         """Columns of noise, as many as outputs, that reach the outputs alone and span them."""
         bounds, ny = self.window.bounds, self.window.plant.ny
-        able = np.flatnonzero((bounds.noise > 0.0) & ~bounds.noise_state.any(axis=0))
-        able = able[[np.count_nonzero(bounds.noise_output[:, k]) == 1 for k in able]] if able.size else able
-        best: dict[int, int] = {}
-        for k in able.tolist():
-            row = int(np.flatnonzero(bounds.noise_output[:, k])[0])
-            best.setdefault(row, k)
-        return np.array([best[row] for row in range(ny)]) if len(best) == ny else np.zeros(0, dtype=np.int64)
+        of_outputs = np.flatnonzero((bounds.noise > 0.0) & ~bounds.noise_state.any(axis=0)).tolist()
+        first_of_row: dict[int, int] = {}
+        for k in of_outputs:
+            rows = np.flatnonzero(bounds.noise_output[:, k])
+            if len(rows) == 1:
+                first_of_row.setdefault(int(rows[0]), k)
+        complete = len(first_of_row) == ny
+        return np.array([first_of_row[row] for row in range(ny)]) if complete else np.zeros(0, dtype=np.int64)
 
     @cached_property
     def _absorbing(self) -> np.ndarray | None:

@@ -81,7 +81,8 @@ def symmetric_certificate(Az: FloatArray) -> tuple[FloatArray, FloatArray, float
 
 
 def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:
-    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer, L = 0; noise where ``-1 / delta`` is a pole."""
+    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer, L = 0; of no use where ``-1 / delta`` is nearly a
+    pole."""
     balanced, units = balanced_matrix(a)
     p = _gram(balanced)
     x = _coupling(balanced, p, delta)
@@ -93,7 +94,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
     balanced, units = balanced_matrix(a)
     driving, output_map = b.midpoint / units[:, None], c * units
     weight = max(largest_singular_value(output_map) ** 2, np.finfo(np.float64).tiny)
-    spare = None
+    in_many_digits = None
     for slack in PD_SLACKS:  # the largest that gives a proof
         out = output_map.T @ output_map + slack * weight * np.eye(len(a))
         p = continuous_solution(balanced.T, driving.T, out, -(gain**2) * np.eye(driving.shape[1]))
@@ -106,8 +107,8 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
         proof = prove_gain(a, b, c, witness, gain)
         if proof.in_double_precision:
             return witness
-        spare = witness if proof.proved and spare is None else spare
-    return spare
+        in_many_digits = witness if proof.proved and in_many_digits is None else in_many_digits
+    return in_many_digits
 
 
 def _gram(a: FloatArray) -> FloatArray:

@@ -85,7 +85,7 @@ class AdaptiveRule(Rule):
             nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
             state = state._replace(nominal=nominal)
             # What box, start and rounding add to the norm of the residual.
-            parts = [thresholds.shift[at], thresholds.rest[at], plan.bound.more[at], *thresholds.first[:, at]]
+            parts = [thresholds.shift[at], thresholds.rest[at], plan.bound.of_tolerances[at], *thresholds.first[:, at]]
             if plan.start_beyond_nominal:
                 parts.append(thresholds.start[at])
             threshold = (threshold + math.fsum(math.hypot(*part) for part in parts)) * THRESHOLD_ROUNDING

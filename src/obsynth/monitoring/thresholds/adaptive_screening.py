@@ -119,7 +119,7 @@ class Screening:
         beside = parts + (np.linalg.norm(start[..., at], axis=2) if plan.start_beyond_nominal else 0.0)
         spread = np.linalg.norm(slack[..., at], axis=2) * (p + 1)
         limit = records.limits[begin:end, None] + beside
-        most = limit + spread + np.linalg.norm(rest[..., at], axis=2) + np.linalg.norm(bound.more[at])
+        most = limit + spread + np.linalg.norm(rest[..., at], axis=2) + np.linalg.norm(bound.of_tolerances[at])
         above |= norm > most * THRESHOLD_ROUNDING * (1.0 + UNDECIDED_SHARE)
         below &= norm <= (limit - spread) * (1.0 - UNDECIDED_SHARE)
         return (above, below), states[:, -1] @ bound.structure.Az.T + into[:, -1]
@@ -202,7 +202,7 @@ class Screening:
         parts = [thresholds.shift[..., at], thresholds.rest[..., at], *np.moveaxis(thresholds.first[..., at], 2, 0)]
         if plan.start_beyond_nominal:
             parts.append(thresholds.start[..., at])
-        beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.more[at])
+        beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.of_tolerances[at])
         limit = (limits[:, None] + np.asarray(beside).T) * THRESHOLD_ROUNDING
         if plan.sample_time is not None:
             # Where the norm passes, one of the rows does.

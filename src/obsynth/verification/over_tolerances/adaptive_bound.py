@@ -1,7 +1,12 @@
 """A bound of residuals and fault estimates over the box of the plant's constants.
 
-``tau_k = nominal + start_k + sum_i |phi_i| + rest_k + rounding_k``: ``phi_i`` filters of the measured signals, one for
-each constant (first order), ``rest`` all higher orders, by a recursion of nonnegative numbers over a ring of L samples.
+The bound at sample k is ``nominal + start_k + sum_i |phi_i| + rest_k + rounding_k``: ``nominal`` of disturbances and
+noise, ``start_k`` of the error at the start, ``phi_i`` filters of the measured signals, one for each constant (first
+order), ``rest`` all higher orders, by a recursion of nonnegative numbers over a ring of L samples.
+
+Letters are those of `error_structure`: eps, the ``nz`` errors of the observer's states; ``no`` outputs (residuals and
+fault estimates); p constants.  A channel is a nonnegative number of each sample, such as ``|c e|``, through which a
+constant drives the errors again: ``m`` channels, of ``rows`` channel rows c.
 """
 
 from __future__ import annotations
@@ -31,7 +36,10 @@ START_RINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveBound:
-    """What a threshold over a box needs online, for ``v = [xhat; u]``; the ring holds ``w`` numbers of each sample."""
+    """What a threshold over a box needs online, for ``v = [xhat; u]``; the ring holds ``w`` numbers of each sample.
+
+    Numbers on channels and outputs are ``(m + no,)``, in this order; those on channels are after the loop at one
+    sample."""
 
     structure: ErrorStructure
     responses: Responses
@@ -39,16 +47,16 @@ class AdaptiveBound:
     drive: FloatArray  # ``(p, nz + rows + no, nv)``: constants to eps, channel rows and outputs
     output_rows: FloatArray  # ``(rows + no, nz)``: eps to channel rows and outputs
     kernels: FloatArray  # ``(L w, m + no + nz)``, oldest first: ring to channels, outputs and eps
-    same: FloatArray  # ``(w, m + no)``: the same at one sample
-    solved: FloatArray  # for the loop of the channels at one sample
-    tail: FloatArray
-    nominal: FloatArray
-    more: FloatArray
+    same: FloatArray  # ``(w, m + no)``: ring to channels and outputs within one sample
+    solved: FloatArray  # ``(m, m)``: inverse of the loop of the channels at one sample
+    tail: FloatArray  # ``(m + no + nz, nz)``: what a bound of eps from before the ring adds
+    nominal: FloatArray  # ``(m + no,)``: what disturbances and noise add, over the whole box
+    of_tolerances: FloatArray  # ``(no,)``: the part of that which is there for the tolerances alone
     rounding: FloatArray  # ``(m + no, nu + ny + n + 1)``, for the largest signals so far
-    start: FloatArray
-    start_later: tuple[float, FloatArray]
-    spans: FloatArray
-    remainder_inputs: tuple[int, ...]
+    start: FloatArray  # ``(samples, m + no)``: what the error at the start adds, sample by sample
+    start_later: tuple[float, FloatArray]  # factor of each ring after these samples, and what it multiplies
+    spans: FloatArray  # ``(p,)``: farthest that each constant is from nominal, in half widths of its range
+    remainder_inputs: tuple[int, ...]  # inputs whose effect has a remainder beyond the first order
     first: FloatArray | None = None  # ``(nz, nu)``: first inputs to the last sensitivity (continuous designs)
 
     @property
@@ -82,9 +90,9 @@ class AdaptiveBound:
     @cached_property
     def tail_rows(self) -> FloatArray:
         """What a bound of eps from before the ring adds to each channel row, ``(rows, nz)``."""
-        left = self.structure.channel_rows @ self.structure.Cx
+        rows = self.structure.channel_rows @ self.structure.Cx
         powers = self.responses.powers
-        return np.asarray((np.abs(left @ powers[-1]) + power_rounding(left, powers)) * OUTWARD)
+        return np.asarray((np.abs(rows @ powers[-1]) + power_rounding(rows, powers)) * OUTWARD)
 
     def start_at(self, k: int) -> FloatArray:
         """Return what the start adds to channels and outputs ``(m + no,)`` at sample k after it."""
@@ -108,7 +116,9 @@ class AdaptiveBound:
 
 
 class Start:
-    """What is known of eps at the start: nothing, ``norm``, or ``center, radius (nz,)``; ``state`` for rounding."""
+    """What is known of eps at the start: nothing, a bound of its ``norm``, or ``center`` and ``radius (nz,)``.
+
+    ``state (nz,)``: the observer's own state then, whose size rounding depends on."""
 
     def __init__(
         self,
@@ -130,10 +140,10 @@ class Start:
         size = np.abs(self.center) + self.radius
         return np.asarray(size if self.norm is None else size + self.norm)
 
-    def largest(self, left: FloatArray) -> FloatArray:
-        """Return the largest size of each row of ``left eps``."""
-        size = np.abs(left @ self.center) + np.abs(left) @ self.radius
-        return np.asarray(size if self.norm is None else size + self.norm * np.linalg.norm(left, axis=-1))
+    def largest(self, rows: FloatArray) -> FloatArray:
+        """Return the largest size of each entry of ``rows @ eps``."""
+        size = np.abs(rows @ self.center) + np.abs(rows) @ self.radius
+        return np.asarray(size if self.norm is None else size + self.norm * np.linalg.norm(rows, axis=-1))
 
 
 def adaptive_bound(
@@ -181,7 +191,7 @@ def adaptive_bound(
         solved=solved,
         tail=tail,
         nominal=outward @ _nominal(structure, responses),
-        more=_nominal(structure, responses, center=False)[m:],
+        of_tolerances=_nominal(structure, responses, center=False)[m:],
         rounding=outward @ _rounding(structure, responses, observer, start.state),
         start=table @ outward.T * OUTWARD,
         start_later=(theta, outward @ settled * OUTWARD),
@@ -194,8 +204,8 @@ def _driven(structure: ErrorStructure, responses: Responses, columns: FloatArray
     """Return the kernels of nonnegative columns into eps, ``(L, columns, m + no + nz)``."""
     powers = responses.powers[:-1]
 
-    def sizes(left: FloatArray) -> FloatArray:
-        return np.asarray((np.abs(left @ powers) + power_rounding(left, powers)) @ columns)
+    def sizes(rows: FloatArray) -> FloatArray:
+        return np.asarray((np.abs(rows @ powers) + power_rounding(rows, powers)) @ columns)
 
     channels = structure.channel_sizes(np.moveaxis(sizes(structure.channel_rows @ structure.Cx), 1, 0))
     parts = [np.moveaxis(channels, 0, 1), sizes(structure.Co), sizes(np.eye(len(structure.Az)))]
@@ -208,7 +218,7 @@ def _start_table(
     """Return what the start adds to channels and outputs, sample by sample, and what goes on decaying after that."""
     both, power, table = (structure.channel_rows @ structure.Cx, structure.Co), np.eye(len(structure.Az)), []
     for _ in range(START_RINGS * responses.length):
-        channels, outputs = (start.largest(left @ power) for left in both)
+        channels, outputs = (start.largest(rows @ power) for rows in both)
         table.append(np.concatenate([structure.channel_sizes(channels), outputs]) * OUTWARD)
         power = structure.Az @ power
     # ``|Az^L| w <= theta w`` is proved.
@@ -217,8 +227,8 @@ def _start_table(
         return np.array(table), (0.0, np.zeros(len(table[0])))
     factor = float(np.max(start.size / weights)) * OUTWARD
     channels, outputs = (
-        (np.abs(left @ responses.powers[:-1]) + power_rounding(left, responses.powers)).max(axis=0) @ weights
-        for left in both
+        (np.abs(rows @ responses.powers[:-1]) + power_rounding(rows, responses.powers)).max(axis=0) @ weights
+        for rows in both
     )
     return np.array(table), (theta, np.concatenate([structure.channel_sizes(channels), outputs]) * factor)
 

@@ -49,7 +49,7 @@ class ErrorStructure:
     single: int  # rows after these share one channel, the largest of them
     effects: FloatArray  # (nz + n + no, m): what a channel does
     owner: tuple[int, ...]  # the constant of each channel
-    offsets: FloatArray
+    offsets: FloatArray  # (p,): nominal values from the middles of their ranges, in half widths
     reading: FloatArray  # xhat (and fhat) from the rows of the observer
     watching: FloatArray
 
