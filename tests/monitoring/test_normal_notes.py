@@ -356,3 +356,28 @@ def test_a_stuck_sensor_is_told_by_validate() -> None:
     (note,) = read_log(data, ["u"], ["ya", "yb"], rows="100:").notes
     assert "yb repeats one value in rows 700 to 708, for longer" in note
     assert read_log(log(1), ["u"], ["ya", "yb"]).notes == ()
+
+
+def test_an_estimate_that_is_not_watched_says_how_many_rows_it_needs_and_a_level_that_alarms() -> None:
+    """One log of a motor: its residuals alarm at the onset of a fault or not at all, and no level was named."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.9, 0.05], [0.0, 0.8]], [[1.0], [0.5]], ["T1", "T2"], Bf=[[1.0], [0.0]], dt=1.0,
+        state_names=["T1", "T2"], input_names=["heat"], fault_names=["loss"], sensor_noise={"T1": 0.05, "T2": 0.05},
+    )  # fmt: skip
+    design, rng, x, rows = obsynth.ui_pi_observer(plant), np.random.default_rng(1), np.zeros(2), []
+    slow = 0.0
+    for k in range(400):
+        slow = 0.995 * slow + 0.01 * rng.standard_normal()
+        rows.append([float(k), 0.0, *(x + 0.05 * rng.standard_normal(2))])
+        x = plant.A @ x + plant.Bf @ [slow + 0.5 * (k >= 250)]
+    data = pd.DataFrame(rows, columns=["time", "heat", "T1", "T2"])
+    learned = obsynth.learn_thresholds(design, data[:250])
+    assert "fhat[loss]" in learned.left_out
+    (note,) = (note for note in learned.notes if note.startswith("fhat[loss] is not watched"))
+    assert int(note.split("about ")[1].split(" ")[0].replace(",", "")) > learned.rows
+    level = float(note.split("such as ")[1].split(",")[0])
+    monitor = obsynth.online_monitor(design, "learned", normal=learned)
+    alarm = obsynth.run_on_data(design, data, monitor=monitor, thresholds={"fhat[loss]": level}).table["alarm"]
+    assert (alarm[:250] == "").all()
+    assert alarm[265:].str.contains("fhat", regex=False).all()
+    assert obsynth.run_on_data(design, data, monitor=monitor).table["alarm"].iloc[-1] == ""

@@ -166,7 +166,7 @@ class LearnedThresholds:
             )
         return (
             f"{text}. Too few rows for this rate ({self.rows}; about {self.needed:,} needed, "
-            f"{_duration(self.needed * self.dt)}): {self._possible_rate_in_words()}"
+            f"{duration(self.needed * self.dt)}): {self._possible_rate_in_words()}"
         )
 
     def _rate_in_words(self) -> Iterator[str]:
@@ -175,7 +175,7 @@ class LearnedThresholds:
         changes = f", and in changes of {_counted(len(estimates), 'fault')}" if estimates else ""
         yield (
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
-            f"({_duration(self.every * self.dt)}) on average, in {_counted(len(self.columns), 'column')}{changes}"
+            f"({duration(self.every * self.dt)}) on average, in {_counted(len(self.columns), 'column')}{changes}"
         )
         yield f"alarms less than {HOLD} rows apart count as one"
         if is_conformal(self.rows, self.pairs.others(self.every)):
@@ -229,7 +229,7 @@ class LearnedThresholds:
         rarest = min(self.rows, self.every)
         return (
             f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
-            f"({_duration(rarest * self.dt)})"
+            f"({duration(rarest * self.dt)})"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -288,7 +288,7 @@ class LearnedThresholds:
         return write_atomically(path, sealed(LEARNED_KIND, LEARNED_VERSION, plain(self.as_dict()), under="thresholds"))
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return seconds in the largest unit of which there is one."""
     name, size = next(((n, s) for n, s in reversed(UNITS.items()) if seconds >= s), ("second", 1.0))
     count = seconds / size

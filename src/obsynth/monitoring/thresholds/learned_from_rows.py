@@ -203,6 +203,33 @@ def _fitted_columns(
     return enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
 
 
+class LeftOut(NamedTuple):
+    """An estimate of a fault that is not watched, though it varies."""
+
+    name: str
+    largest: float  # of its absolute value in the rows that were learned from
+    is_redundant: bool  # whether the other columns say the same
+    needed: int  # rows with which it would be watched; 0 where no number of them is known
+
+
+def left_out_estimates(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> list[LeftOut]:
+    """Return the estimates that thresholds which were ``learned`` from ``rows (n, m)`` do not watch."""
+    names, faults = watched_names(design), len(design.observer.fault_names)
+    complete = complete_rows(design, learned, rows)
+    values = rows[complete]
+    left_out = [i for i in varying(values, 0) if i < faults and names[i] in learned.left_out]
+    if not left_out:
+        return []
+    usual = [i for i, name in enumerate(names) if name not in learned.seldom]
+    together = [usual[i] for i in independent(values[:, usual])]
+    model = fitted_autoregression(np.where(complete[:, None], rows[:, together], np.nan))
+    needed = rows_needed(model, 1.0) if model.is_regular else 0
+    return [
+        LeftOut(names[i], float(np.abs(values[:, i]).max()), i not in together, needed if needed > len(values) else 0)
+        for i in left_out
+    ]
+
+
 def seldom_known(rows: FloatArray, faults: int) -> list[int]:
     """Return the residuals of rows ``(n, m)``, after so many estimates of ``faults``, without which at least half of
     the rows are whole: those of sensors that are slower than the rows.  One residual is left."""

@@ -27,13 +27,19 @@ from obsynth.monitoring.thresholds.learned import NO_PAIRS, LearnedThresholds, W
 from obsynth.monitoring.thresholds.learned_from_rows import (
     LEAST_NORMAL,
     divided_at_starts,
+    left_out_estimates,
     raised_levels,
     thresholds_from_rows,
     watched_rows,
 )
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.monitor import Evidence
-from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows, notes_of_sizes, notes_of_starts
+from obsynth.monitoring.thresholds.normal_notes import (
+    notes_of_left_out,
+    notes_of_normal_rows,
+    notes_of_sizes,
+    notes_of_starts,
+)
 from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
 from obsynth.monitoring.thresholds.sensor_drifts import (
     DRIFT_ROWS,
@@ -217,6 +223,7 @@ def learn_thresholds(
         notes=(
             *_notes_of_cells([stamps for _, stamps in read], signals),
             *notes,
+            *notes_of_left_out(left_out_estimates(design, learned, output.watched), learned),
             *notes_of_sizes(white, inputs),
             *notes_of_starts(divided),
         ),

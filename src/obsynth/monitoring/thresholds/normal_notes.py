@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import stuck_texts
-from obsynth.monitoring.thresholds.learned_from_rows import Raised
+from obsynth.monitoring.thresholds.learned import LearnedThresholds, duration
+from obsynth.monitoring.thresholds.learned_from_rows import LeftOut, Raised
 from obsynth.monitoring.thresholds.learned_levels import CHANCE_DEVIATIONS, normal_scores
 from obsynth.numerics.arrays import FloatArray
 
@@ -20,6 +21,10 @@ MOVES = 5.0
 #: Rows from a move on whose residuals are compared with those of as many rows without one, the least number of moves,
 #: the share of the residuals that counts as large, and how many times as large these must be to be reported.
 AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
+
+
+#: A level of an estimate that is not watched: its largest value without a fault, and half as much as room for others.
+ROOM_ABOVE = 1.5
 
 
 def notes_of_normal_rows(
@@ -81,6 +86,26 @@ def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
         f"varies by {share:.2g} of its standard deviation here. A run with another start may alarm without a fault: go "
         "on from the state of this log (--state), or state the offset."
         for name, share in divided.items()
+    )
+
+
+def notes_of_left_out(estimates: Sequence[LeftOut], learned: LearnedThresholds) -> tuple[str, ...]:
+    """Return what is to be known of estimates of faults that are not watched."""
+
+    def reason(estimate: LeftOut) -> str:
+        if estimate.is_redundant:
+            return "the other columns follow from it in these rows, or it from them"
+        if estimate.needed:
+            lasting = duration(estimate.needed * learned.dt)
+            needed = f"about {estimate.needed:,} ({lasting}) are needed"
+            return f"it varies too slowly for {learned.rows:,} rows; {needed}"
+        return "it follows something slow or periodic in these rows, which is no noise"
+
+    return tuple(
+        f"{estimate.name} is not watched: {reason(estimate)}. It is {estimate.largest:.3g} at most here: a level above "
+        f"(--threshold, thresholds), such as {ROOM_ABOVE * estimate.largest:.2g}, alarms for as long as a fault lasts, "
+        "with no rate that is known."
+        for estimate in estimates
     )
 
 

@@ -86,6 +86,11 @@ def _lines(design: ObserverDesign, learned: LearnedThresholds) -> Iterator[str]:
             "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
             "not at all. Give run a level for the estimate as well (--threshold)."
         )
+    if learned.logs == 1:
+        yield (
+            "One log says nothing of what differs between logs: other starts, set points and drifts. Give three normal "
+            "logs or more where they differ (--data a.csv b.csv c.csv)."
+        )
     yield from learned.notes
 
 
