@@ -57,3 +57,32 @@ def test_gain_and_least_gain_meet_whatever_the_index(index: int, seed: int) -> N
     design = obsynth.optimal_filter(scrambled(seed, index))
     assert design.report.passed
     assert 0.0 < design.least <= design.gain < design.least * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("index", "norm"), [(2, "hinf"), pytest.param(3, "hinf", marks=pytest.mark.long), (2, "h2"), (3, "h2")]
+)
+def test_matching_whose_best_filter_reads_later_inputs_is_that_of_outputs_read_late(index: int, norm: str) -> None:
+    one_late = {"A": [[0.0]], "B": [[1.0]], "C": [[1.0]], "D": [[0.0]]}
+    design = obsynth.optimal_filter(scrambled(0, index), reference=one_late, exact=False, norm=norm)
+    assert design.report.passed
+    assert f"reads each output {index - 1} sample" in design.notes[-1]
+    claims = design.certificate.claims
+    own, least = (claims[name] for name in (("gain", "least") if norm == "hinf" else ("deviation", "least_deviation")))
+    assert 0.0 < least <= own <= 1.0 + 1e-6  # that of no filter
+
+
+def test_faults_that_do_nothing_are_no_rounding_of_other_inputs() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=[[0, 1], [0, 0]],
+        A=[[-1, 0.5], [0, -0.5]],
+        C=[[-3, -2], [-6, -1]],
+        Bf=[[0], [0]],
+        Bd=[[-3, -1], [0, 2]],
+        Dd=[[-3, -1], [3, 0]],
+        Bw=[[-1, 0, 0], [2, 0, 0]],
+        Dw=[[0, 0.1, 0], [0, 0, 0.1]],
+        dt=0.1,
+    )
+    with pytest.raises(obsynth.PreconditionError, match="cannot be told from each other"):
+        obsynth.optimal_filter(plant)

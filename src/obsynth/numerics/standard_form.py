@@ -89,7 +89,9 @@ def standard_form(
     reached = reachable_basis(A, B)
     A, B, C = reached.T @ A @ reached, reached.T @ B, C @ reached
     observable = reachable_basis(A.T, C.T)
-    return StandardForm(observable.T @ A @ observable, observable.T @ B, C @ observable, D, shift, point)
+    # Bases at right angles leave rounding of other inputs in the columns of those that do nothing.
+    acting = np.any(b != 0.0, axis=0) | np.any(d != 0.0, axis=0)
+    return StandardForm(observable.T @ A @ observable, observable.T @ B * acting, C @ observable, D, shift, point)
 
 
 def _cayley_of_descriptor(

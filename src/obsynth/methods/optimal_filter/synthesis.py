@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
-from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError, counted
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
@@ -32,11 +32,12 @@ from obsynth.methods.optimal_filter.lasting_modes import (
     with_growing_modes_reached,
     with_lasting_modes_driven,
 )
+from obsynth.methods.optimal_filter.late_outputs import output_delay, shows_later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order
 from obsynth.methods.optimal_filter.reference import plain
-from obsynth.methods.optimal_filter.weights import plain_weights
+from obsynth.methods.optimal_filter.weights import in_series, plain_weights
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
@@ -49,7 +50,7 @@ from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import stability_factor
-from obsynth.verification.invisible_faults import seen_plant
+from obsynth.verification.invisible_faults import has_index_one, seen_plant
 
 #: A delay is taken when its least gain is at most this much above that of the longest one that was tried.
 DELAY_ROOM = 1.05
@@ -65,6 +66,10 @@ LASTING_NOTE = (
     "A mode of the plant does not decay, and no noise drives it: a filter of least gain may ignore it, and its "
     "errors do not decay then. This one was found with a little noise on that mode; its claims are for the plant "
     "without it."
+)
+LATE_NOTE = (
+    "Outputs of this plant show inputs of later samples (its index is 2 or more): this filter reads each output "
+    "{} late. The least gain is that of all causal filters."
 )
 #: A filter forgets modes that last as fast as its deviation is at most this much above the least one.
 FORGETTING_ROOM = 1.01
@@ -87,10 +92,40 @@ def synthesise(plant: DescriptorSystem, options: OptimalFilterMethod, *, progres
         progress("building the realisation and its certificate")
         return _made(plant, options, curve, chosen)
     except (PreconditionError, SolverError):
+        made = _with_late_outputs(plant, options)
+        if made is not None:
+            return made
         if with_lasting_modes_driven(plant) is plant:
             raise
     progress("searching the least gain with noise on modes that last")
     return _with_every_start(plant, options) if options.norm == "h2" else _with_lasting_modes(plant, options)
+
+
+def _with_late_outputs(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis | None:
+    """Return the filter of least gain that reads no output before the inputs which it shows have acted.
+
+    Outputs of index 2 or more show inputs of later samples, of which the errors of no stored realisation are a state:
+    that of a filter which takes the outputs as many samples later is.  ``None`` for another plant, or without one.
+    """
+    if not plant.is_discrete or has_index_one(plant):
+        return None
+    try:
+        late = first_problem(plant, options)[1].shift
+        if not late:
+            return None
+        delayed = with_late_outputs(plant, late)
+        _, chosen = _chosen(delayed, options)
+        least = designed(plant, chosen.fault_map, options.norm)
+    except PreconditionError:
+        return None
+    chosen = chosen._replace(
+        filter=in_series(output_delay(plant.ny, late), chosen.filter),
+        problem=replace(chosen.problem, shift=chosen.problem.shift + late),
+        decays=least.decays,
+        least=min(least.gain, chosen.gain) if options.norm == "h2" else None,
+    )
+    made = _made(plant, options, [], chosen)
+    return replace(made, notes=(*made.notes, LATE_NOTE.format(counted(late, "sample"))))
 
 
 def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
@@ -286,6 +321,11 @@ def _with_enough_noise(
 def _realised(plant: DescriptorSystem, chosen: Designed) -> tuple[Followed, LinearObserver, float]:
     """Return a filter's realisation, and by which share it misses its fault map."""
     problem, fault_map = chosen.problem, chosen.fault_map
+    if problem.shift and shows_later_inputs(plant, chosen.filter):
+        raise SolverError(
+            "The filter of least gain reads outputs that show inputs of later samples, of which its errors are no "
+            "state: the result is inconclusive. Give a longer delay."
+        )
     outputs = PlantUnits.of(plant).rounded().outputs
     ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
     # One of few states may follow the plant by states that y does not reach.

@@ -1,0 +1,79 @@
+"""A sampled plant whose outputs come some samples late, and the delay that a filter puts before itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from obsynth.methods.optimal_filter.weights import in_series
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.standard_form import standard_form
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
+
+#: What a filter shows of later inputs, as a share of what cancels in it, without being rounding.
+LATER_SHARE = 1e-6
+
+
+def shows_later_inputs(plant: DescriptorSystem, filter_: Model) -> bool:
+    """Whether a filter's estimates depend on inputs to the plant's equations of later samples.
+
+    ``E x+ = A x + g``: outputs of index 2 or more depend on g of later samples, with coefficients that a filter may
+    cancel, or not.
+    """
+    units = PlantUnits.of(plant).rounded()
+    equations, outputs = units.equations[:, None], units.outputs[:, None]
+    e, a, c = equations * plant.E * units.states, equations * plant.A * units.states, outputs * plant.C * units.states
+    form = standard_form(e, a, np.eye(plant.nx), c, np.zeros((plant.ny, plant.nx)), plant.dt)
+    own = filter_[0], filter_[1] / units.outputs, filter_[2], filter_[3] / units.outputs
+    shown = _first_responses(in_series((form.A, form.B, form.C, form.D), own), form.shift)
+    sizes = [
+        sum(float(np.linalg.norm(part)) for part in _first_responses(model, form.shift))
+        for model in (own, (form.A, form.B, form.C, form.D))
+    ]
+    return any(float(np.linalg.norm(part)) > LATER_SHARE * sizes[0] * sizes[1] for part in shown)
+
+
+def _first_responses(model: Model, count: int) -> list[FloatArray]:
+    """Return what a model shows of an impulse, sample by sample."""
+    a, b, c, d = model
+    responses, moved = [d][:count], b
+    while len(responses) < count:
+        responses.append(c @ moved)
+        moved = a @ moved
+    return responses
+
+
+def with_late_outputs(plant: DescriptorSystem, samples: int) -> DescriptorSystem:
+    """Return a sampled plant whose outputs are those of some samples before, as states at the end."""
+    ny, count = plant.ny, plant.ny * samples
+    late = np.zeros((count, plant.nx))
+    late[:ny] = plant.C
+
+    def below(columns: FloatArray, through: FloatArray) -> FloatArray:
+        entering = np.zeros((count, columns.shape[1]))
+        entering[:ny] = through
+        return np.vstack([columns, entering])
+
+    return DescriptorSystem(
+        E=block_diag(plant.E, np.eye(count)),
+        A=np.block([[plant.A, np.zeros((plant.nx, count))], [late, np.eye(count, k=-ny)]]),
+        C=np.hstack([np.zeros((ny, plant.nx + count - ny)), np.eye(ny)]),
+        B=below(plant.B, plant.D),
+        Bf=below(plant.Bf, plant.Df),
+        Bd=below(plant.Bd, plant.Dd),
+        Bw=below(plant.Bw, plant.Dw),
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        fault_names=plant.fault_names,
+        disturbance_names=plant.disturbance_names,
+        noise_names=plant.noise_names,
+    )
+
+
+def output_delay(ny: int, samples: int) -> Model:
+    """Return the delay of all outputs by some samples."""
+    count = ny * samples
+    return np.eye(count, k=-ny), np.eye(count, ny), np.eye(ny, count, k=count - ny), np.zeros((ny, ny))
