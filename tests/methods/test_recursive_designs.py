@@ -95,6 +95,16 @@ def test_a_time_invariant_plant_states_its_noise() -> None:
     assert "No noise is stated: Q and R taken as the identity" in bare.notes[0]
 
 
+def test_noise_in_turned_axes_is_as_independent_as_before() -> None:
+    # Bw Dw' is zero but for the rounding of the turn.
+    turn = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))[0]
+    process, sensors = np.hstack([0.1 * np.eye(2), np.zeros((2, 2))]), np.hstack([np.zeros((2, 2)), 0.2 * np.eye(2)])
+    plant = DescriptorSystem(A=[[0.9, 0.1], [0, 0.8]], C=np.eye(2), Bw=process @ turn, Dw=sensors @ turn, dt=1.0)
+    assert np.any(plant.Bw @ plant.Dw.T)
+    design = obsynth.descriptor_kalman(plant)
+    np.testing.assert_allclose(design.observer.R.at(0), 0.04 * np.eye(2), atol=1e-15)
+
+
 @pytest.mark.long
 def test_callables_are_used_but_not_saved(tmp_path: Path) -> None:
     stacked = obsynth.descriptor_kalman(varying(horizon=60), Q=np.tile(0.1 * np.eye(3), (60, 1, 1)), R=0.2)

@@ -195,7 +195,7 @@ def with_stated_noise(
     missing = [name for name in ("Q", "R") if resolved[name] is None]
     if not isinstance(plant, DescriptorSystem) or not plant.nw or not missing:
         return resolved
-    if np.any(plant.Bw @ plant.Dw.T):
+    if np.any(product_but_rounding(plant.Bw, plant.Dw.T)):
         raise SpecError(
             "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does not "
             "cover: state independent noises, or give Q and R.",

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.ranks import covariance_factor, product_but_rounding
 from obsynth.plants.polytopic import PolytopicSystem
 
 
@@ -40,7 +40,11 @@ class NoiseOverRegion:
     def of(cls, plant: PolytopicSystem, Q: Any, R: Any) -> NoiseOverRegion:
         """Return the noise of options Q and R over a region, checked; `SpecError` for what it cannot be."""
         first = plant.vertices[0]
-        if plant.nw and (Q is None or R is None) and any(np.any(v.Bw @ v.Dw.T) for v in plant.vertices):
+        if (
+            plant.nw
+            and (Q is None or R is None)
+            and any(np.any(product_but_rounding(v.Bw, v.Dw.T)) for v in plant.vertices)
+        ):
             raise SpecError(
                 "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does "
                 "not cover: state independent noises, or give Q and R.",
