@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -141,3 +142,20 @@ def test_a_copy_makes_no_default_slower_beside_process_noise(seed: int, dt: floa
         )  # fmt: skip
         rates.append(obsynth.ui_pi_observer(plant).certificate.claims["decay"])
     assert rates[1] > rates[0] / 1.001
+
+
+@pytest.mark.parametrize("combination", [[3.7, 0.0], pytest.param([0.3, -1.1], marks=pytest.mark.long)])
+def test_the_least_gain_with_a_dependent_sensor_is_proved(combination: list[float]) -> None:
+    a = np.array([[0.3, -0.2, 0.1], [0.0, 0.5, 0.4], [-0.3, 0.1, 0.2]])
+    c = np.array([[1.0, 0.4, -0.7], [0.2, -1.1, 0.5]])
+    bd = np.array([[0.3, 0.0, 0.2], [-0.1, 0.4, 0.0], [0.2, 0.1, -0.3]])
+    plant = obsynth.DescriptorSystem(A=a, C=np.vstack([c, combination @ c]), Bf=[[1.0], [0.5], [-0.4]], Bd=bd, dt=1.0)
+    design = obsynth.fault_estimation_filter(plant, prove_least=True)
+    row = design.report["least gain"]
+    assert row.kind == "proved"
+    assert row.passed
+    # Filters that read less have a larger least gain: a proof of that is none.
+    matrices = design.certificate.matrices
+    fewer = {**matrices, "least_gain_outputs": matrices["least_gain_outputs"][:1]}
+    forged = design.replace(certificate=replace(design.certificate, matrices=fewer))
+    assert not obsynth.verify(forged)["least gain"].passed

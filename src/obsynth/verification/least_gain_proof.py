@@ -5,8 +5,9 @@ pair (e, d) with ``C e + D d`` in the range of Upsilon leads to the next error a
 ``Q = image F F' image' - top F F' top' >= 0`` is a mixture of pairs that can follow each other, so that ``g^2 |bottom
 F|^2 >= |xi of F|^2 + tr P Q``, ``P >= 0``; where W is fixed, one more disturbance ``d = K e`` (and M, from rest) shows
 before any gain can act: ``tr P Q >= |xi of (e, K e)|^2 - g^2 |K e|^2`` over Q. S and the pairs are rational, from the
-stored numbers, so that nothing is nearly invisible; the sums are in ball arithmetic. Source: ours, the dual of Wang
-2015, eq. (45).
+stored numbers, so that nothing is nearly invisible; the sums are in ball arithmetic. Where outputs depend on others,
+which rounding hides, filters that read as many combinations as are independent are looked at. Source: ours, the dual of
+Wang 2015, eq. (45).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from flint import fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import squared_norm
 from obsynth.proofs.exact_arithmetic import (
@@ -46,7 +48,10 @@ SUM_BITS = 512
 #: Names of the certificate's matrices: F, K and M; one that is left out is zero.
 LEAST_GAIN_PAIRS, LAST, ALONE = "least_gain_pairs", "least_gain_last", "least_gain_alone"
 
-LEAST_GAIN_WITNESSES = frozenset({LEAST_GAIN_PAIRS, LAST, ALONE})
+#: Name of the combinations ``(m, ny)`` of outputs that the filters of the proof read, all outputs where there is none.
+OUTPUTS_READ = "least_gain_outputs"
+
+LEAST_GAIN_WITNESSES = frozenset({LEAST_GAIN_PAIRS, LAST, ALONE, OUTPUTS_READ})
 
 #: The least gain found counts as proved where the proved bound is below it by this share at most.
 PROVED_SHARE = 1e-4
@@ -72,11 +77,25 @@ class InvisiblePairs:
     Zd: Any
 
     @classmethod
-    def of(cls, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> InvisiblePairs | None:
-        """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states."""
+    def of(
+        cls, work: DescriptorSystem, gains: Mapping[str, FloatArray], outputs: FloatArray | None = None
+    ) -> InvisiblePairs | None:
+        """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states.
+
+        ``outputs (m, ny)``: combinations of outputs, stated where filters that read these alone are looked at."""
         if work.nx > MOST_EXAMINED_STATES or not work.nd:
             return None
-        parts = (*(gains[letter] for letter in ("T", "N", "L", "W", "Upsilon")), work.A, work.C, work.Bd, work.Dd)
+        read = () if outputs is None else (np.ascontiguousarray(outputs, dtype=np.float64),)
+        if any(part.ndim != 2 or part.shape[1] != work.ny or not np.all(np.isfinite(part)) for part in read):
+            return None
+        parts = (
+            *(gains[letter] for letter in ("T", "N", "L", "W", "Upsilon")),
+            work.A,
+            work.C,
+            work.Bd,
+            work.Dd,
+            *read,
+        )
         return cls._of(*((part.shape, part.tobytes()) for part in parts))
 
     # Synthesis and verification ask for those of the same numbers.
@@ -84,13 +103,14 @@ class InvisiblePairs:
     @lru_cache(maxsize=2)
     def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
         matrices, unit = whole_matrices([np.frombuffer(data).reshape(shape) for shape, data in numbers])
-        t, n, feedback, w, upsilon, plain, c, bd, dd = matrices
+        t, n, feedback, w, upsilon, plain, c, bd, dd, *read = matrices
         # Whole numbers: a and z are `unit^2` times what they stand for, b and zd `unit^4` times.
         square = unit * unit
         ta, direct = t * plain, dd * square - c * (n * dd)
         a, b = ta - feedback * c, t * bd * square - ta * (n * dd) - feedback * direct
         z, zd = w * c, w * direct
-        pairs, size, free = whole_null_basis(blocks([[fmpq_mat(c), fmpq_mat(direct) / square, fmpq_mat(upsilon)]]))
+        shows = blocks([[fmpq_mat(c), fmpq_mat(direct) / square, fmpq_mat(upsilon)]])
+        pairs, size, free = whole_null_basis(fmpq_mat(read[0]) * shows if read else shows)
         states, inputs = int(plain.ncols()), int(bd.ncols())
         # A start has `size` times x where a state is free, and these come first.
         own = [j for j in free if j < states]
@@ -168,7 +188,11 @@ def least_gain_row(
             status="assumed",
             detail=detail,
         )
-    pairs = None if work is None else InvisiblePairs.of(work, gains)
+    outputs = matrices.get(OUTPUTS_READ)
+    if outputs is not None:
+        family = f"{family} that reads these combinations of dependent outputs"
+    whole = work is not None and (outputs is None or _read_everything(work, outputs))
+    pairs = InvisiblePairs.of(work, gains, outputs) if work is not None and whole else None
     bound = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
     holds = bound * (1.0 - BOUND_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= bound
     return Check(
@@ -182,6 +206,14 @@ def least_gain_row(
         "proved",
         f"proved: at least {bound:.9g}",
     )
+
+
+def _read_everything(work: DescriptorSystem, outputs: FloatArray) -> bool:
+    """Return whether combinations of outputs hold all that the outputs do, but for rounding."""
+    if outputs.ndim != 2 or outputs.shape[1] != work.ny or not np.all(np.isfinite(outputs)):
+        return False
+    shown = np.hstack([work.C, work.Dd])
+    return decide_rank(outputs @ shown).rank == decide_rank(shown).rank
 
 
 def _definite(matrix: Any) -> bool:

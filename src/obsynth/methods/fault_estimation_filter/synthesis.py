@@ -55,7 +55,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.results.design import Certificate
-from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES, least_gain_row
+from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES, OUTPUTS_READ, least_gain_row
 
 #: Gains that take the outputs.
 _OF_OUTPUTS = ("N", "L", "W", "R")
@@ -173,26 +173,30 @@ def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthe
         synthesis,
         gains=gains,
         observer=averaged(observer, mean) if mean > 1 else observer,
-        certificate=_where_it_holds(synthesis, work, gains),
+        certificate=_where_it_holds(synthesis, work, gains, weights),
     )
 
 
-def _where_it_holds(synthesis: Synthesis, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> Certificate:
-    """Return the certificate without a proof of the least gain that does not hold for all outputs: what no gain sees of
-    merged ones may be visible by the rounding of gains that are for all."""
+def _where_it_holds(
+    synthesis: Synthesis, work: DescriptorSystem, gains: Mapping[str, FloatArray], weights: FloatArray
+) -> Certificate:
+    """Return the certificate with a proof of the least gain that holds: of all filters, or of those that read merged
+    outputs.  What no gain sees of these may be visible by the rounding of dependent ones, to gains of any size."""
     certificate = synthesis.certificate
     if not LEAST_GAIN_WITNESSES & certificate.matrices.keys():
         return certificate
-    row = least_gain_row(
-        work,
-        gains,
-        certificate.matrices,
-        certificate.claims["gamma_min"],
-        free_weight=synthesis.options["weight"] == "free",
-        thorough=False,
-    )
-    if row.passed:
-        return certificate
+    for more in ({}, {OUTPUTS_READ: weights}):
+        matrices = {**certificate.matrices, **more}
+        row = least_gain_row(
+            work,
+            gains,
+            matrices,
+            certificate.claims["gamma_min"],
+            free_weight=synthesis.options["weight"] == "free",
+            thorough=False,
+        )
+        if row.passed:
+            return replace(certificate, matrices=matrices)
     held = {name: part for name, part in certificate.matrices.items() if name not in LEAST_GAIN_WITNESSES}
     return replace(certificate, matrices=held)
 
