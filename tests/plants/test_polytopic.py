@@ -134,3 +134,49 @@ def test_an_input_that_is_one_in_every_row_is_kept_and_must_be_an_input() -> Non
     assert plant.scheduling.rate_of_weight > 0.1
     with pytest.raises(SpecError, match="no input"):
         PolytopicSystem(plant=given, scheduling={"k": [1, 6]}, shift="other")
+
+
+@pytest.mark.parametrize(
+    ("entry", "path"),
+    [
+        ({"column": ""}, "scheduling.v.column"),
+        ({"column": 3}, "scheduling.v.column"),
+        ({"column": ["v"]}, "scheduling.v.column"),
+        ({"column": True}, "scheduling.v.column"),
+        ({"unit": 3}, "scheduling.v.unit"),
+        ({"column": "w"}, "scheduling.w.column"),
+    ],
+    ids=str,
+)
+def test_columns_and_units_are_texts_and_every_parameter_has_its_own_column(
+    entry: dict[str, object], path: str
+) -> None:
+    A = [["0.5 + 0.1 * v", "0.1 * w"], [0, 0.4]]
+    with pytest.raises(SpecError) as refused:
+        PolytopicSystem(
+            plant={"A": A, "C": [[1, 0]], "dt": 1.0}, scheduling={"v": {"range": [-1, 1], **entry}, "w": [0, 1]}
+        )
+    assert refused.value.path == path
+
+
+def test_a_point_that_is_no_numbers_is_refused() -> None:
+    with pytest.raises(SpecError, match="by name or in order"):
+        _pendulum().at("v")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_order_and_the_units_of_parameters_change_no_point(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b, c, d = rng.standard_normal(4).round(3).tolist()
+    factor, point = float(10.0 ** rng.integers(-6, 7)), rng.uniform(0, 1, 2)
+
+    def plant(scheduling: dict[str, list[float]], v: str = "v") -> PolytopicSystem:
+        A = [[f"{a} * {v} + {b}", f"sin({v}) * w"], [f"{c} * w", d]]
+        return PolytopicSystem(plant={"A": A, "C": [[1, 0]], "dt": 1.0}, scheduling=scheduling)
+
+    expected = plant({"v": [-1, 1], "w": [0, 2]}).at({"v": point[0], "w": point[1]}).A
+    for other, v in (
+        (plant({"w": [0, 2], "v": [-1, 1]}), point[0]),
+        (plant({"v": [-factor, factor], "w": [0, 2]}, f"(v / {factor!r})"), point[0] * factor),
+    ):
+        assert pytest.approx(expected, rel=1e-12, abs=1e-12) == other.at({"v": v, "w": point[1]}).A

@@ -34,6 +34,8 @@ RATE_TOLERANCE = 1e-6
 LARGEST_WHOLE = 1e15
 #: Keys of a parameter as it is given.
 PARAMETER_KEYS = ("range", "rate", "column", "unit", "measured")
+#: Those that are texts, where they are there.
+_TEXTS = {"column": "the name of a column of logs", "unit": "a unit"}
 
 #: Functions that have one name in formulas and in numpy.
 _NAMES = ["sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs", "sign", "floor", "ceil"]
@@ -172,7 +174,12 @@ class Scheduling:
                     path="scheduling",
                 )
             point = [point[name] for name in self.names]
-        values = np.asarray(point, dtype=np.float64).ravel()
+        try:
+            values = np.asarray(point, dtype=np.float64).ravel()
+        except (TypeError, ValueError):
+            raise SpecError(
+                f"Scheduling parameters are {shown(point)}: give numbers, by name or in order.", path="scheduling"
+            ) from None
         if values.shape != (len(self.names),):
             raise SpecError(f"Give {len(self.names)} scheduling parameters.", path="scheduling")
         return values
@@ -312,8 +319,28 @@ def parameters_of(scheduling: Any) -> dict[str, dict[str, Any]]:
             )
         _require_range(str(name), *map(float, ends))
         _require_rate(str(name), entry.get("rate"))
+        for key, meaning in _TEXTS.items():
+            if entry.get(key) is not None and not (isinstance(entry[key], str) and entry[key].strip()):
+                raise SpecError(
+                    f"The {key} of {name!r} is {shown(entry[key])}: give {meaning}, as text.", path=f"{path}.{key}"
+                )
         checked[str(name)] = {**entry, "range": [float(ends[0]), float(ends[1])]}
+    _require_own_columns(checked)
     return checked
+
+
+def _require_own_columns(parameters: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse two parameters that are read from one column: they are one parameter."""
+    owners: dict[str, str] = {}
+    for name, entry in parameters.items():
+        column = str(entry.get("column") or name)
+        if column in owners:
+            raise SpecError(
+                f"{owners[column]!r} and {name!r} are read from the same column {column!r}: write one parameter in the "
+                "entries of both.",
+                path=f"scheduling.{name}.column",
+            )
+        owners[column] = name
 
 
 @dataclass(frozen=True, eq=False)
