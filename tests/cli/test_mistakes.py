@@ -257,3 +257,23 @@ def test_a_column_that_is_missing_is_mapped_by_its_signal(words: list[str], told
     assert main(["design", "--system", str(THERMAL), "--output", gains, "--quiet"]) == 0
     assert main(["run", "--gains", gains, "--data", str(tmp_path / "log.csv"), *words, "--quiet"]) == 2
     assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"), [("Ts", "'dt'"), ("fault_name", "'fault_names'"), ("F", "'Bf'"), ("zzz", "")]
+)
+def test_an_argument_by_another_name_is_asked_about(wrong: str, meant: str) -> None:
+    with pytest.raises(TypeError) as raised:
+        obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], **{wrong: None})  # type: ignore[arg-type]
+    question = f" Did you mean {meant}?" if meant else ""
+    assert str(raised.value) == f"DescriptorSystem has no argument {wrong!r}.{question}"
+
+
+def test_one_name_and_one_number_are_told_how_they_are_written() -> None:
+    given = {"A": [[0.5]], "C": [[1.0]], "Bf": [[1.0]], "dt": 1.0}
+    with pytest.raises(obsynth.SpecError, match=r"list of non-empty texts\. Give \['leak'\]\."):
+        obsynth.DescriptorSystem(**given, fault_names="leak")
+    assert obsynth.DescriptorSystem(**given, fault_names=["leak"]).fault_names == ("leak",)
+    with pytest.raises(obsynth.SpecError, match=r"needs a profile, such as obsynth\.Step\(size=2\), or a list"):
+        obsynth.Scenario(horizon=3, faults={"f1": 2.0})  # type: ignore[dict-item]
+    assert obsynth.Scenario(horizon=3, faults={"f1": obsynth.Step(size=2)}).faults

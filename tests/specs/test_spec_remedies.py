@@ -158,7 +158,8 @@ def test_a_key_of_a_plant_at_the_top_is_told_where_it_belongs(tmp_path: Path) ->
 
 
 def test_a_folder_is_asked_about_by_the_specs_in_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "spec.yaml").write_text(SPEC, encoding="utf-8")
+    for name in ("spec.yaml", "plant.yaml"):
+        (tmp_path / name).write_text(SPEC, encoding="utf-8")
     assert main(["design", "--system", str(tmp_path)]) == 2
     assert f"is a folder: give the name of a file. Did you mean {tmp_path / 'spec.yaml'}?" in capsys.readouterr().err
 

@@ -123,11 +123,12 @@ def _similar_files(path: Path) -> str:
 
 
 def _files_inside(folder: Path) -> str:
-    """Return a question with the specs in a folder, where there are few; empty else."""
+    """Return a question with the specs in a folder, ``spec.yaml`` where there is one; empty where there are many."""
     try:
         specs = sorted(entry for entry in folder.iterdir() if entry.suffix in (".yaml", ".yml") and entry.is_file())
     except OSError:
         return ""
+    specs = [entry for entry in specs if entry.name in ("spec.yaml", "spec.yml")] or specs
     return f" Did you mean {' or '.join(map(str, specs))}?" if 0 < len(specs) <= MOST_FILES_NAMED else ""
 
 

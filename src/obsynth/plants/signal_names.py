@@ -53,7 +53,8 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     names = plain_names(names)
     listed = tuple(names) if isinstance(names, Iterable) else (names,)
     if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in listed):
-        raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
+        remedy = f" Give [{names!r}]." if isinstance(names, str) and names.strip() and count == 1 else ""
+        raise SpecError(f"{what} must be a list of non-empty texts.{remedy}", path=what)
     if len(listed) != count:
         there = counted(count, *_COUNTED[what]) if what in _COUNTED else f"{count}"
         raise SpecError(f"{what} has {counted(len(listed), 'name')}, but the plant has {there}.", path=what)

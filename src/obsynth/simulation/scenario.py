@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array, real_number, require_kind, whole_number
+from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -280,7 +280,10 @@ def _checked_profiles(
         profiles = (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
         where = f"{group}.{name}"
         if not profiles or not all(isinstance(profile, Profile) for profile in profiles):
-            raise SpecError(f"{name!r} needs a profile, or a list of them.", path=where)
+            size = float(value) if is_number(value) else 1.0
+            raise SpecError(
+                f"{name!r} needs a profile, such as obsynth.Step(size={size:g}), or a list of them.", path=where
+            )
         for profile in profiles:
             if not isinstance(profile, kinds):
                 raise SpecError(

@@ -13,10 +13,10 @@ from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
 from obsynth.methods.registry import AUTO, REGISTRY, method_class
 from obsynth.numerics.arguments import field_types, is_whole
+from obsynth.plants.other_names import name_meant
 from obsynth.plants.signal_names import suggestion
 from obsynth.specs.lines import composed, line_of
 from obsynth.specs.remedies import (
-    instead_of_key,
     instead_of_list,
     instead_of_matrix,
     instead_of_number,
@@ -399,7 +399,7 @@ def _explained(
         known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
         beside = _value_at(document, location[:-1])
         beside = list(beside) if isinstance(beside, dict) else []
-        meant = instead_of_key(key, known, beside) or _option_hint(key, prefix, names, known)
+        meant = name_meant(key, known, beside) or _option_hint(key, prefix, names, known)
         text = f"unknown key.{meant or _plant_hint(key, prefix, names)}"
     elif kind == "missing":
         needed = ": give the seconds between samples, or 0 for a plant in continuous time"

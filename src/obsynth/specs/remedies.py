@@ -7,26 +7,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number
-from obsynth.plants.signal_names import suggestion
 from obsynth.specs.matrix_files import MATRIX_SUFFIXES
-
-#: Names by which books, Simulink and other libraries call what a spec calls otherwise.
-OTHER_NAMES = {
-    **dict.fromkeys(("Ts", "ts", "T", "h", "sample_time", "sampling_time", "time_step", "step", "period"), "dt"),
-    **dict.fromkeys(("F", "Ba", "E_f", "Ef"), "Bf"),
-    **dict.fromkeys(("Bv", "Ed", "E_d"), "Bd"),
-    **dict.fromkeys(("G", "Gamma"), "Bw"),
-    **dict.fromkeys(("states", "x"), "state_names"),
-    **dict.fromkeys(("outputs", "sensors", "y"), "output_names"),
-    **dict.fromkeys(("inputs", "u"), "input_names"),
-    **dict.fromkeys(("faults", "f"), "fault_names"),
-}
 
 #: Matrices that every plant has.
 NEEDED_MATRICES = ("A", "C")
@@ -42,14 +28,6 @@ _PICKS = {
 
 #: A matrix with at most this many numbers is written out in a message.
 LARGEST_EXAMPLE = 12
-
-
-def instead_of_key(key: str, known: Sequence[str], present: Sequence[str] = ()) -> str:
-    """Return which key may be meant: one by another name, or one that is written alike; ``present`` are there."""
-    other = OTHER_NAMES.get(key)
-    if other in known and other not in present:
-        return f" Did you mean {other!r}?"
-    return suggestion(key, known)
 
 
 def instead_of_number(value: Any) -> str:

@@ -1,0 +1,50 @@
+"""Arguments and keys of a plant by the names that books, Simulink and other libraries have for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import wraps
+from inspect import signature
+from typing import ParamSpec, TypeVar
+
+from obsynth.plants.signal_names import suggestion
+
+Given = ParamSpec("Given")
+
+Returned = TypeVar("Returned")
+
+#: What is meant by each of these names.
+OTHER_NAMES = {
+    **dict.fromkeys(("Ts", "ts", "T", "h", "sample_time", "sampling_time", "time_step", "step", "period"), "dt"),
+    **dict.fromkeys(("F", "Ba", "E_f", "Ef"), "Bf"),
+    **dict.fromkeys(("Bv", "Ed", "E_d"), "Bd"),
+    **dict.fromkeys(("G", "Gamma"), "Bw"),
+    **dict.fromkeys(("states", "x"), "state_names"),
+    **dict.fromkeys(("outputs", "sensors", "y"), "output_names"),
+    **dict.fromkeys(("inputs", "u"), "input_names"),
+    **dict.fromkeys(("faults", "f"), "fault_names"),
+}
+
+
+def name_meant(name: str, known: Iterable[str], present: Iterable[str] = ()) -> str:
+    """Return a question with the name that is meant, after a blank: another name of the same, or one that is written
+    alike; ``present`` are there already.  Empty where none is close."""
+    names, other = list(known), OTHER_NAMES.get(name)
+    if other in names and other not in present:
+        return f" Did you mean {other!r}?"
+    return suggestion(name, names)
+
+
+def keywords_suggested(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+    """Return a constructor that asks about keyword arguments which it does not have, as Python's `TypeError`."""
+    parameters = tuple(signature(function).parameters)[1:]
+
+    @wraps(function)
+    def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        unknown = next((name for name in kwargs if name not in parameters), None)
+        if unknown is not None:
+            name = function.__qualname__.partition(".")[0]
+            raise TypeError(f"{name} has no argument {unknown!r}.{name_meant(unknown, parameters, kwargs)}")
+        return function(*args, **kwargs)
+
+    return called
