@@ -392,7 +392,12 @@ KEYS: Keys = {
         "digest": ("", "SHA-256 of the log that the numbers were found in; checked when it is read.", "9f86d081..."),
     },
     "MatrixFile": {
-        "file": ("", "Matrix Market (`.mtx`), `.npz`, `.mat` or `.csv`, beside the spec.", "A.mtx"),
+        "file": (
+            "",
+            "Matrix Market (`.mtx`), `.npz`, `.mat` or `.csv`, beside the spec. A `.csv` holds numbers alone, a row a "
+            "line, separated by commas, semicolons, tabs or blanks, without a line of names.",
+            "A.csv",
+        ),
         "variable": ("", "Name of the matrix in the file.", "A"),
     },
     "VaryingFile": {
