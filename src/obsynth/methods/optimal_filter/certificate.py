@@ -10,7 +10,7 @@ import scipy.linalg
 
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import Designed
+from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed
 from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
@@ -26,12 +26,16 @@ from obsynth.verification.invisible_faults import Setting, proved_least, proved_
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+#: More of them for a gain that is below this share of what the noise could do in a sample, whatever cancels.
+SMALL_GAIN, SMALL_GAIN_ROOMS = 1e-4, np.geomspace(2.0, 1e6, 20)
 #: At so many of them all eigenvalues of the Hamiltonian matrix are enclosed, in some tenths of a second each.
 MOST_ENCLOSURES = 5
 #: Levels that are claimed of a gain that is zero but for rounding, in units of what counts as zero.
 ZERO_LEVELS = (1.0, 1e1, 1e2, 1e3, 1e4)
 #: Slacks of the inequality that the certificate solves, of the square of the output matrix.
 SLACKS = (1e-3, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
+#: A deviation that comes out otherwise than in the search, by this share, is that of rounding where it is small.
+ROUNDING_OF_DEVIATIONS = 1e-7
 #: A bound this near the gain, as a share of it, is not improved further: the search of the gain ends at 1e-8.
 CLOSE_ENOUGH = 3e-8
 #: What is claimed of a proved bound: machines differ in the last digits of the combination that they find.
@@ -58,15 +62,16 @@ def certified(
     claims = {"order": float(observer.order)}
     if fault_map.delay is not None:
         claims["delay"] = float(fault_map.delay)
-    if norm == "h2":
-        return {}, claims | {
-            "deviation": 0.0 if chosen.is_nothing else chosen.gain,
-            "least_deviation": 0.0 if chosen.is_nothing else chosen.gain if chosen.least is None else chosen.least,
-        }
     model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
     channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
-    factors = [factor * chosen.nothing for factor in ZERO_LEVELS] if chosen.is_nothing else []
-    levels = factors or [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
+    if norm == "h2":
+        return {}, claims | _deviations(chosen, channel, plant.dt)
+    if chosen.is_nothing:
+        levels = [factor * chosen.nothing for factor in ZERO_LEVELS]
+    else:
+        levels = [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
+    # A gain far below what the noise could do may be lost in the stored numbers, which have a larger one then.
+    levels += [float(level) for level in levels[-1] * SMALL_GAIN_ROOMS if level <= SMALL_GAIN * channel.size]
     matrices: dict[str, FloatArray] = {}
     for number, level in enumerate(levels):
         P = gain_matrix(channel, level, plant.dt, chosen.problem.alpha)
@@ -88,6 +93,14 @@ def certified(
     if chosen.is_nothing:
         return matrices, claims
     return matrices | _lower_bounds(plant, chosen, claims), claims
+
+
+def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str, float]:
+    """Return the claims of a filter of least mean square: of rounding, a bound on that of the stored numbers."""
+    own, gain = channel.deviation(dt), 0.0 if chosen.is_nothing else chosen.gain
+    if ZERO_GAIN * channel.size < own <= channel.rounding and abs(own - gain) > ROUNDING_OF_DEVIATIONS * gain:
+        return {"deviation": float(10.0 ** np.ceil(np.log10(2.0 * own))), "least_deviation": 0.0}
+    return {"deviation": gain, "least_deviation": gain if chosen.is_nothing or chosen.least is None else chosen.least}
 
 
 def gain_matrix(channel: ErrorChannel, level: float, dt: float, alpha: float) -> FloatArray | None:

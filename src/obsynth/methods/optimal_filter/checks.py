@@ -44,6 +44,8 @@ from obsynth.verification.plant import plant_information
 FAULT_MAP_SHARE = 1e-6
 #: A recomputed deviation repeats the claimed one to this share.
 DEVIATION_SHARE = 1e-6
+#: The bound on a deviation that is rounding is a power of ten, at most so many times as large.
+ROUNDING_ROOM = 20.0
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -322,7 +324,10 @@ def _bound_row(name: str, claim: str, bound: float | None, stated: float, detail
 
 
 def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) -> Check:
-    deviation = channel.deviation(plant.dt)
+    deviation, source = channel.deviation(plant.dt), "Lyapunov equation"
+    if 0.0 < stated <= ROUNDING_ROOM * channel.rounding and deviation <= channel.rounding:
+        claim = "root mean square of the error for white noise: rounding, of which this is a bound"
+        return upper_bound_check("deviation", claim, deviation, stated, source=source, kind="computed")
     # Of zero nothing but rounding may be left.
     unit = stated if stated else channel.size * ZERO_GAIN / DEVIATION_SHARE
     return upper_bound_check(
@@ -330,7 +335,7 @@ def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) ->
         "root mean square of the error for white noise, recomputed: relative difference",
         abs(deviation - stated) / max(unit, float(np.finfo(float).tiny)),
         DEVIATION_SHARE,
-        source="Lyapunov equation",
+        source=source,
         kind="computed",
     )
 

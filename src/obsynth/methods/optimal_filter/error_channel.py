@@ -15,10 +15,12 @@ from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, natural_scaling
 
 #: What passes directly to the error is rounding below so many bounds on the rounding of its terms.
 ROUNDED_UNITS = 1e4
+#: Of what noise could do at most, what stored numbers may leave where everything cancels.
+ROUNDED_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,12 @@ class ErrorChannel:
         """What the noise could do to the error in a sample, whatever cancels."""
         model = self.model
         observer, plant = model.observer, model.plant
-        own = np.abs(model.own) @ np.abs(plant.Bw) + np.abs(observer.By) @ np.abs(plant.Dw)
+        own = np.abs(observer.By) @ np.abs(plant.Dw)
+        if len(model.own):
+            # T may hold nothing but rounding where the noise enters: of its rows the largest entries count.
+            equations = natural_scaling(plant).equations
+            rows_of_t = np.max(np.abs(model.own) / equations, axis=1, keepdims=True)
+            own = own + rows_of_t * np.max(equations[:, None] * np.abs(plant.Bw), axis=0, initial=0.0)
         direct = np.abs(observer.Dy) @ np.abs(plant.Dw)
         if model.T0 is not None:
             direct = direct + np.abs(model.T0[:, : plant.nx]) @ np.abs(plant.Bw)
@@ -60,6 +67,11 @@ class ErrorChannel:
         """The matrices in double precision."""
         a, b, c, d = self(Ball)
         return a.midpoint, b.midpoint, c.midpoint, d.midpoint
+
+    @property
+    def rounding(self) -> float:
+        """A deviation below this may be rounding of stored numbers: of such a one only an upper bound is claimed."""
+        return ROUNDED_SHARE * self.size
 
     def deviation(self, dt: float) -> float:
         """Return the root mean square of the error for white noise of unit intensity; infinite where this passes."""

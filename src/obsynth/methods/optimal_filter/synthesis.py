@@ -450,6 +450,7 @@ def _statement(curve: list[_Row], chosen: Designed, options: OptimalFilterMethod
         of = of.replace("causal filters, linear or not,", "causal linear filters")
         own, least = claims["deviation"], claims["least_deviation"]
         reached = "reached by this filter" if own == least else f"this filter: {own:.8g}"
+        reached = reached if least or not own else f"{reached}, which is rounding"
         text = f"Least deviation {of}: {least:.8g}, {reached}."
     elif chosen.is_nothing:
         text = f"Least gain from disturbances and noise together, {of}: 0; this filter: 0 but for rounding."
