@@ -1,4 +1,4 @@
-"""Every shipped design as C, in one program: on a log with blanks it says what `obsynth run` says, row by row."""
+"""Every shipped design as C: on a log with blanks it says what `obsynth run` says, row by row."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ctypes
 import shutil
 import subprocess
 import zipfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -188,34 +189,52 @@ def harness(design: obsynth.ObserverDesign, name: str) -> tuple[str, int]:
     return text, last + 5
 
 
+class Shipped:
+    """The shipped designs with their C, each made when a test needs it; they are not verified here."""
+
+    names = (*LINEAR, *NONLINEAR, WALKING, SLOWLY_SEEN)
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._made: dict[str, tuple[obsynth.ObserverDesign, list[Path], int]] = {}
+        self._code: dict[str, ctypes.CDLL] = {}
+
+    def made(self, name: str) -> tuple[obsynth.ObserverDesign, list[Path], int]:
+        """Return a design, its C with a program that runs it, and the numbers of a row that this writes."""
+        if name not in self._made:
+            holds = SimpleNamespace(passed=True, failures=(), checks=())
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("obsynth.methods.designing.verify", lambda design, **_: holds)
+                design = designed(name).replace(report=VerificationReport())
+                monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
+                stem, rate = c_identifier(name), SAMPLE_TIME if design.observer.dt == 0.0 else None
+                sources = obsynth.export(design, self.folder / f"{stem}.c", sample_time=rate, monitor=monitor)
+            text, width = harness(design, stem)
+            (self.folder / f"{stem}_run.c").write_text(f'#include "{stem}.h"\n{text}')
+            files = [*(file for file in sources if file.suffix == ".c"), self.folder / f"{stem}_run.c"]
+            self._made[name] = design, files, width
+        return self._made[name]
+
+    def design(self, name: str) -> obsynth.ObserverDesign:
+        return self.made(name)[0]
+
+    def compiled(self, library: Path, names: Sequence[str]) -> ctypes.CDLL:
+        """Return the C of designs in one library, compiled with warnings as errors."""
+        files = [str(file) for name in names for file in self.made(name)[1]]
+        command = [str(COMPILER), *FLAGS, *files, "-o", str(library), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[:4000]
+        return ctypes.CDLL(str(library))
+
+    def code(self, name: str) -> ctypes.CDLL:
+        if name not in self._code:
+            self._code[name] = self.compiled(self.folder / f"{c_identifier(name)}.so", [name])
+        return self._code[name]
+
+
 @pytest.fixture(scope="module")
-def shipped(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """All designs in one library, compiled with warnings as errors; they are not verified here."""
-    folder = tmp_path_factory.mktemp("c")
-    patch = pytest.MonkeyPatch()
-    holds = SimpleNamespace(passed=True, failures=(), checks=())
-    patch.setattr("obsynth.methods.designing.verify", lambda design, **_: holds)
-    designs = {
-        name: designed(name).replace(report=VerificationReport())
-        for name in (*LINEAR, *NONLINEAR, WALKING, SLOWLY_SEEN)
-    }
-    widths, runs, sources = {}, [], []
-    for name, design in designs.items():
-        continuous = design.observer.dt == 0.0
-        monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
-        stem = c_identifier(name)
-        sources += obsynth.export(
-            design, folder / f"{stem}.c", sample_time=SAMPLE_TIME if continuous else None, monitor=monitor
-        )
-        text, widths[name] = harness(design, stem)
-        runs.append(f'#include "{stem}.h"\n{text}')
-    patch.undo()
-    (folder / "all.c").write_text("\n".join(runs))
-    files = [str(file) for file in (*sources, folder / "all.c") if file.suffix == ".c"]
-    command = [str(COMPILER), *FLAGS, *files, "-o", str(folder / "all.so"), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[:4000]
-    return SimpleNamespace(designs=designs, widths=widths, code=ctypes.CDLL(str(folder / "all.so")), folder=folder)
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
+    return Shipped(tmp_path_factory.mktemp("c"))
 
 
 def test_every_shipped_design_is_one_of_these() -> None:
@@ -229,6 +248,7 @@ def test_every_shipped_design_is_one_of_these() -> None:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", NONE)
+@pytest.mark.usefixtures("taken_as_verified")
 def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
     refused = {"motor/one_encoder": "torque detectable", "moussaali2013_ltv/as_printed": "residual directions"}
     if name in refused:
@@ -241,12 +261,13 @@ def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_fmu_holds_the_c_that_is_tested_here(shipped: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_fmu_holds_the_c_that_is_tested_here(shipped: Shipped, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of every design, with the same monitor; test_fmu_export runs the wrapper around it."""
     from obsynth.exporting.fmu import archive
 
     monkeypatch.setattr(archive, "_binary", lambda *_: None)
-    for name, design in shipped.designs.items():
+    for name in shipped.names:
+        design = shipped.design(name)
         stem, rate = c_identifier(name), {"sample_time": SAMPLE_TIME} if design.observer.dt == 0.0 else {}
         monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
         (unit,) = obsynth.export(design, shipped.folder / f"{stem}.fmu", monitor=monitor, **rate)
@@ -256,8 +277,11 @@ def test_an_fmu_holds_the_c_that_is_tested_here(shipped: SimpleNamespace, monkey
         assert inside == alone.replace(stem, "observer").replace(stem.upper(), "OBSERVER")
 
 
-def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:
+def test_headers_say_what_a_controller_needs(shipped: Shipped) -> None:
     """Units, names of columns, the operating point, alarms, the monitor, the status of verification, and C++."""
+    names = ("threetank/spec", "wang2015/spec", WALKING)
+    for name in names:
+        shipped.made(name)
     tanks = (shipped.folder / "threetank_spec.h").read_text()
     assert 'extern "C"' in tanks
     assert '/* faults[0]: "fhat[leak]", "V^0.5/s" */' in tanks
@@ -269,24 +293,30 @@ def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:
     assert "UNVERIFIED: no check was made" in tanks
     cc = shutil.which("g++")
     if cc is not None:
-        text = "\n".join(f'#include "{c_identifier(name)}.h"' for name in shipped.designs)
+        text = "\n".join(f'#include "{c_identifier(name)}.h"' for name in names)
         (shipped.folder / "all.cpp").write_text(text + "\nint main() { return 0; }\n")
         subprocess.run([cc, "-Wall", "-Werror", "-fsyntax-only", str(shipped.folder / "all.cpp")], check=True)
 
 
+@pytest.mark.long
+def test_all_designs_fit_into_one_program(shipped: Shipped) -> None:
+    code = shipped.compiled(shipped.folder / "all.so", shipped.names)
+    assert all(hasattr(code, f"run_{c_identifier(name)}") for name in shipped.names)
+
+
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no compiler of C++")
 @pytest.mark.long
-def test_every_source_is_cplusplus_too(shipped: SimpleNamespace) -> None:
+def test_every_source_is_cplusplus_too(shipped: Shipped) -> None:
     """Who builds controllers in C++ compiles sources as such: casts, tables and enumerations are checked more."""
-    files = [str(file) for file in sorted(shipped.folder.glob("*.c"))]
+    files = [str(file) for name in shipped.names for file in shipped.made(name)[1]]
     command = [str(shutil.which("g++")), "-x", "c++", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", *files]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[:4000]
 
 
 @pytest.mark.long
-def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> None:
-    design = shipped.designs[WALKING]
+def test_c_finds_changes_of_faults_as_a_run_does(shipped: Shipped) -> None:
+    design = shipped.design(WALKING)
     alone = told(design)
     statistics = replace(alone.statistics, estimates=())
     alone = replace(alone, statistics=statistics, levels=alone.levels[: len(statistics.names)])
@@ -302,8 +332,8 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> No
 
 
 @pytest.mark.long
-def test_floats_find_changes_of_faults_too(shipped: SimpleNamespace, tmp_path: Path) -> None:
-    design = shipped.designs[WALKING]
+def test_floats_find_changes_of_faults_too(shipped: Shipped, tmp_path: Path) -> None:
+    design = shipped.design(WALKING)
     monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
     sources = obsynth.export(design, tmp_path / "walking.c", monitor=monitor, precision="float", unverified=True)
     text, width = harness(design, "walking")
@@ -351,8 +381,8 @@ MANY_STATES = {"ieee14/spec": 5e-12}
 
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [*LINEAR, *NONLINEAR])
-def test_c_says_what_a_run_says(shipped: SimpleNamespace, name: str) -> None:
-    log = log_of(shipped.designs[name])
+def test_c_says_what_a_run_says(shipped: Shipped, name: str) -> None:
+    log = log_of(shipped.design(name))
     same_as_c(shipped, name, log, log, list(range(ROWS)))
 
 
@@ -360,12 +390,12 @@ def test_c_says_what_a_run_says(shipped: SimpleNamespace, name: str) -> None:
 @pytest.mark.parametrize(
     "name", [name for name in (*LINEAR, *NONLINEAR, WALKING, SLOWLY_SEEN) if name not in CONTINUOUS]
 )
-def test_c_at_its_clock_says_what_a_run_says_of_a_log_with_all_flaws(shipped: SimpleNamespace, name: str) -> None:
-    same_as_c(shipped, name, *flawed(shipped.designs[name]), least={"ok", "gap", "repeated stamp", "out of order"})
+def test_c_at_its_clock_says_what_a_run_says_of_a_log_with_all_flaws(shipped: Shipped, name: str) -> None:
+    same_as_c(shipped, name, *flawed(shipped.design(name)), least={"ok", "gap", "repeated stamp", "out of order"})
 
 
 def same_as_c(
-    shipped: SimpleNamespace,
+    shipped: Shipped,
     name: str,
     log: pd.DataFrame,
     clock: pd.DataFrame,
@@ -374,7 +404,7 @@ def same_as_c(
     least: set[str] | None = None,
 ) -> None:
     """C says at each row of its clock what a run says at that row of a log."""
-    design = shipped.designs[name]
+    design = shipped.design(name)
     dt = design.observer.dt or SAMPLE_TIME
     monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False, unverified=True)
     nonlinear = isinstance(design.observer, DAEObserver)
@@ -391,9 +421,9 @@ def same_as_c(
     scaled = clock.to_numpy()[:, 1:] * [scales.get(column, 1.0) for column in clock.columns[1:]]
     count = len(names) + nonlinear + 1
     head = [0.3] * len(names) + [0.0] * (count - len(names)) + [WARM_UP * dt]
-    given, out = np.concatenate([head, scaled.ravel()]), np.full((ROWS, shipped.widths[name]), np.inf)
+    given, out = np.concatenate([head, scaled.ravel()]), np.full((ROWS, shipped.made(name)[2]), np.inf)
     pointer = ctypes.POINTER(ctypes.c_double)
-    function = getattr(shipped.code, f"run_{c_identifier(name)}")
+    function = getattr(shipped.code(name), f"run_{c_identifier(name)}")
     function(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), ROWS)
     out, scaled = out[rows], scaled[rows]
     columns = [column for column in run.columns if column.startswith(("xhat[", "fhat[", "sd ", "r["))]
@@ -417,9 +447,9 @@ def same_as_c(
 
 
 @pytest.mark.long
-def test_floats_keep_the_bound_that_their_header_states(shipped: SimpleNamespace, tmp_path: Path) -> None:
+def test_floats_keep_the_bound_that_their_header_states(shipped: Shipped, tmp_path: Path) -> None:
     """Against doubles, for signals within one unit; and the bound is not idle."""
-    design = shipped.designs["wang2015/spec"]
+    design = shipped.design("wang2015/spec")
     found = {}
     for precision, kind in (("double", ctypes.c_double), ("float", ctypes.c_float)):
         stem = f"wang_{precision}"
