@@ -109,7 +109,7 @@ CASES: dict[str, tuple[Callable[[DescriptorSystem], tuple[Condition, ...]], Desc
         fault_filter_conditions,
         # With one of the two the fault has a zero at 2.
         made(None, [[0.5, 0], [0.5, 2]], C=[[1, 1], [1, 1 + LITTLE]], Bf=[[1], [0.5]], dt=0.1),
-        "rank C",
+        "rank [C Dd]",
     ),
     "filter: a state": (
         fault_filter_conditions,
@@ -183,7 +183,7 @@ def test_the_witness_has_the_other_answer(case: str) -> None:
     changed = [found for found in conditions(doubt.witness.plant(plant)) if not found.holds]
     # Faults that are alike do not show at all, at no pole of their models; outputs that are alike are one, which has
     # the zero.
-    others = {"rank C": "fault zeros"}.get(name, f"{name.split()[0]} detectable")
+    others = {"rank [C Dd]": "fault zeros"}.get(name, f"{name.split()[0]} detectable")
     assert {name, others} & {found.name for found in changed}
     assert all(found.unclear is None for found in changed)
 

@@ -53,7 +53,7 @@ def test_right_sides_of_a_window_are_exact() -> None:
     """``B u`` and ``y - D u``, of doubles that no double sums up: 0.1 + 3 * 0.7."""
     plant = SimpleNamespace(B=np.array([[0.1, 3.0]]), D=np.array([[0.7, -0.3]]), nx=1, ny=1)
     window = SimpleNamespace(
-        plant=plant, rows=3, equations=1, outputs_at=1, question=SimpleNamespace(samples=2), standing=()
+        plant=plant, rows=3, equations=1, outputs_at=1, test_problem=SimpleNamespace(samples=2), standing=()
     )
     u, y = np.array([[1.0, 0.7], [0.2, 5.0]]), np.array([[0.4], [0.9]])
     exact = [[Fraction(float(value)) for value in row] for row in np.vstack([plant.B, plant.D, u])]

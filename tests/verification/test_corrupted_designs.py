@@ -282,7 +282,8 @@ def grown(matrix: np.ndarray, rows: int, columns: int, corner: float = 0.0) -> n
 
 def with_repeated_output(design: ObserverDesign) -> ObserverDesign:
     """The last output once more, as it is without the unknown inputs; the observer does not use it, so all else stays
-    true.  With it there are fewer independent directions of C than independent outputs."""
+    true.  With it there are fewer independent directions of C than independent outputs: their difference measures an
+    unknown input."""
     plant, observer = design.plant, design.observer
     again = {
         name: np.vstack([getattr(plant, name), getattr(plant, name)[-1:]]) for name in ("C", "D", "Df", "Dd", "Dw")
@@ -547,7 +548,10 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
         "quiet", plant_field(Bf=np.zeros((3, 1))), ("exists: rank F", *ESTIMATES, *OTHER_GAINS)),
     "two faults in one direction": (
         "paper", lambda d: with_plant(d, Bf=d.plant.Bf[:, [0, 0]]), ("exists: rank F", *ESTIMATES, *OTHER_GAINS)),
-    "a repeated output, disturbance and noise": ("direct", with_repeated_output, ("exists: rank C",)),
+    "a repeated output but for the disturbance, which it measures": ("direct", with_repeated_output, (PAPERS,)),
+    "outputs that show nothing": (
+        "quiet", lambda d: with_plant(d, C=0.0 * d.plant.C),
+        ("exists: rank [C Dd]", RESTRICTED, WEIGHT, MATRIX, REALISED, DYNAMICS, STATE, FAULT, RESIDUAL)),
     "an algebraic state that nothing measures": (
         "quiet", lambda d: with_state(d, e=0.0, a=1.0, measured=False, estimated_by=None),
         ("exists: rank [E; C]", STATE, GAINS)),

@@ -287,8 +287,7 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
         )
         return text, names
 
-    name = "rank [C Dd]" if plant.Dd.any() else "rank C"
-    yield judge.full_rank(name, outputs, repeated, source=source)
+    yield judge.full_rank("rank [C Dd]", outputs, repeated, source=source)
     yield judge.full_rank("rank [E; C]", states, unknown, source="Wang 2015, eq. (2)")
 
 

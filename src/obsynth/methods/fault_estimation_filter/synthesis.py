@@ -146,7 +146,7 @@ def _for_independent_outputs(
         f"{choice} is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
         f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave {option} out: a filter exists, and such "
         "outputs are merged by their noise then.",
-        condition="rank C",
+        condition="rank [C Dd]",
     )
 
 
