@@ -86,3 +86,16 @@ def test_faults_that_do_nothing_are_no_rounding_of_other_inputs() -> None:
     )
     with pytest.raises(obsynth.PreconditionError, match="cannot be told from each other"):
         obsynth.optimal_filter(plant)
+
+
+def test_a_fast_zero_that_a_lag_hardly_shows_is_not_taken_for_one_that_it_cancels() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[-0.25, 0], [-0.5, -0.5]],
+        C=[[-2, 0]],
+        Bf=[[-4], [-1]],
+        Df=[[-0.5]],  # a zero at 15.75
+        Bw=[[2, 0], [3, 0]],
+        Dw=[[0, 0.1]],
+    )
+    with pytest.raises(obsynth.PreconditionError, match="zero that is not strictly stable"):
+        obsynth.optimal_filter(plant)

@@ -165,3 +165,22 @@ def test_modes_that_y_does_not_reach_are_states_all_the_same() -> None:
     assert design.report.passed
     assert design.observer.order == 3
     assert design.least == pytest.approx(design.gain, rel=1e-6)
+
+
+@pytest.mark.long
+def test_more_states_are_never_worse_than_no_filter() -> None:
+    """The search of two states ends where the gain has a peak of 3.26 between the angles that it looks at."""
+    rng = np.random.default_rng([9, 131])
+    rng.integers(2, 6), rng.integers(1, 4), rng.integers(1, 3), rng.choice([0, 1.0])
+    a = rng.standard_normal((2, 2))
+    case = obsynth.DescriptorSystem(
+        A=a - (max(np.linalg.eigvals(a).real) + 0.3) * np.eye(2),
+        C=rng.standard_normal((2, 2)),
+        Bf=rng.standard_normal((2, 2)),
+        Df=rng.standard_normal((2, 2)) * (rng.random() < 0.5),
+        Bw=np.hstack([rng.standard_normal((2, 2)) * 0.3, np.zeros((2, 2))]),
+        Dw=np.hstack([np.zeros((2, 2)), 0.1 * np.eye(2)]),
+    )
+    design = obsynth.optimal_filter(case, reference={"bandwidth": 1.0}, exact=False, order_limit=2)
+    assert design.report.passed
+    assert design.gain <= 1.0 + 1e-6

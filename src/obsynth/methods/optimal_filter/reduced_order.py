@@ -40,15 +40,16 @@ def filters_of_order(plant: DescriptorSystem, chosen: Designed, limit: int, full
             f"No filter with this fault map and fewer than {full} states was found: the result is inconclusive. "
             f"Give order_limit={full}."
         )
-    filters: list[tuple[Designed, float] | None] = []
-    if sum(least) <= limit:
-        filters = [_filter(plant, chosen, problem, criterion, degrees, norm) for degrees in _shared(least, limit)]
+    # A search of more states may end in a worse minimum than one of fewer, or than no filter at all.
+    orders = dict.fromkeys(order for order in (limit, limit - 1, sum(least)) if sum(least) <= order <= limit)
+    tried = [degrees for order in orders for degrees in _shared(least, order)]
+    filters = [_filter(plant, chosen, problem, criterion, degrees, norm) for degrees in tried]
     stable = sorted((one for one in filters if one is not None), key=lambda one: one[1])
     if stable:
         return [filter_ for filter_, _ in stable]
-    orders = range(max(sum(least), limit + 1), full)
+    larger = range(max(sum(least), limit + 1), full)
     # The filter of least gain is a stable one of its order.
-    works = next((k for k in orders if any(is_stabilised(problem, one) for one in _shared(least, k))), full)
+    works = next((k for k in larger if any(is_stabilised(problem, one) for one in _shared(least, k))), full)
     if sum(least) > limit:
         raise InfeasibleError(
             f"No filter of at most {limit} states has this fault map and follows the plant's states: each has at least "

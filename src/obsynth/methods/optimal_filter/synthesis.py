@@ -268,12 +268,18 @@ def _recomputed_gain(
 def _of_low_order(
     plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str
 ) -> tuple[Designed, Followed, LinearObserver]:
-    """Return the first filter of low order whose realisation keeps the fault map, with its own gain."""
+    """Return the filter of low order with the least gain of its own, of those whose realisation keeps the fault map.
+
+    They come in the order of their norms at some angles, between which a gain may have its peak.
+    """
+    best: tuple[Designed, Followed, LinearObserver] | None = None
     for filter_ in filters_of_order(plant, chosen, limit, full, norm):
         realised = _of_at_most(plant, filter_, limit)
         gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
-        if realised is not None and math.isfinite(gain):
-            return filter_._replace(gain=gain), *realised
+        if realised is not None and gain < (math.inf if best is None else best[0].gain):
+            best = filter_._replace(gain=gain), *realised
+    if best is not None:
+        return best
     raise SolverError(
         f"The filters of at most {limit} states that were found keep the fault map by rounding only: the result is "
         f"inconclusive. Give a larger order_limit: the filter of least gain has {full} states."
