@@ -184,3 +184,19 @@ def test_more_states_are_never_worse_than_no_filter() -> None:
     design = obsynth.optimal_filter(case, reference={"bandwidth": 1.0}, exact=False, order_limit=2)
     assert design.report.passed
     assert design.gain <= 1.0 + 1e-6
+
+
+@pytest.mark.long
+def test_a_search_that_reaches_no_error_at_all_ends_there() -> None:
+    case = obsynth.DescriptorSystem(
+        E=[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+        A=[[-1.25, -0.0, 0.25, -0.75], [0.5, -1.0, 0.25, 0.5], [0.25, -0.5, -1.5, 0.25], [0.25, 0.5, 0.25, -0.75]],
+        C=[[2.0, 4.0, 1.0, -0.0], [-2.0, -2.0, -1.0, 0.0], [0.0, 3.0, -4.0, -2.0]],
+        B=[[-2.0, -2.0], [-1.0, 0.0], [3.0, -0.0], [2.0, 4.0]],
+        Bf=[[2.0], [1.0], [0.0], [1.0]],
+        Df=[[0.0], [0.0], [0.0]],
+        Bd=[[0.5], [0.0], [0.5], [0.5]],
+        Dd=[[0.0], [0.0], [0.0]],
+    )
+    design = obsynth.optimal_filter(case, reference={"bandwidth": 3.0}, decoupled="d1", order_limit=2)
+    assert design.report.passed

@@ -372,7 +372,9 @@ def _logarithm(
         return UNSTABLE, np.zeros_like(t)
     errors, inverse, response = _errors(problem, rows, criterion, t)
     squares, vectors = np.linalg.eigh(errors @ np.conj(np.swapaxes(errors, 1, 2)))
-    largest = max(float(np.max(squares, initial=0.0)), SMALLEST)
+    largest = float(np.max(squares, initial=0.0))
+    if largest <= SMALLEST:  # nothing is left to be made smaller
+        return 0.5 * float(np.log(SMALLEST)), np.zeros_like(t)
     squares = np.maximum(squares / largest, 0.0)
     total = max(float(np.sum(criterion.shares[:, None] * squares**exponent)), SMALLEST)
     slopes = criterion.shares[:, None] * squares ** (exponent - 1) / (total * largest)
