@@ -20,6 +20,7 @@ from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.proofs.contraction import prove_contraction
@@ -28,6 +29,7 @@ from obsynth.results.checks import Check, fitting_check, lower_bound_check, uppe
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed, listed_gains
 from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
+from obsynth.verification.fault_map_zeros import VANISHING_SHARE, missed_zeros
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import proof_row, prove_norm, stability_row
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
@@ -75,6 +77,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )
     if options["exact"]:
         yield _fault_map(design, model)
+        yield from _zeros(design, plant)
     weights = _claimed_map(design).weights
     channel = ErrorChannel(model, None if options["exact"] else _reference(matrices), weights)
     if options["norm"] == "h2":
@@ -235,6 +238,22 @@ def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
         source=f"transfer functions at {count} points, which determine them",
         kind="equality",
     )
+
+
+def _zeros(design: ObserverDesign, plant: DescriptorSystem) -> Iterator[Check]:
+    """Yield the row on the zeros of faults that are not strictly stable, where there are any."""
+    fault_map = _claimed_map(design)
+    missed = missed_zeros(plant, reference=fault_map.reference, delays=fault_map.delays)
+    if missed:
+        yield upper_bound_check(
+            "zeros of the faults",
+            "the fault map is zero where no output shows the faults: at their zeros that are not strictly stable",
+            max(zero.share for zero in missed),
+            VANISHING_SHARE,
+            source="invariant zeros of the plant, and the fault map at them",
+            kind="equality",
+            detail=", ".join(pole_text(zero.value, 6, pair=True) for zero in missed),
+        )
 
 
 def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int]:

@@ -31,6 +31,7 @@ from obsynth.numerics.standard_form import cayley, cayley_point, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
+from obsynth.verification.fault_map_zeros import require_vanishing
 from obsynth.verification.invisible_faults import Setting, seen_plant
 from obsynth.verification.weighted_plant import weighted_plant
 
@@ -166,11 +167,14 @@ def first_problem(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, 
     for fault_map in _open_maps(plant, options):
         try:
             problem = problem_of(plant, fault_map)
+            # A zero far out changes so little of a problem's numbers that the equations take it for rounding.
+            if fault_map.exact:
+                require_vanishing(plant, reference=fault_map.reference, delays=fault_map.delays)
             require_stable_filter(problem)
         except PreconditionError as error:
             last = error
-            # Neither depends on the delay.
-            if error.condition in ("decoupling", "zeros") and plant.is_discrete:
+            # None depends on the delay, nor the last on how many lags there are.
+            if error.condition == "fault map" or (error.condition in ("decoupling", "zeros") and plant.is_discrete):
                 break
         else:
             return fault_map, problem
