@@ -51,6 +51,7 @@ from obsynth.plants.faults import Exosystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
 from obsynth.plants.transformations.recovery import Transformation
+from obsynth.plants.transformations.repeated_disturbances import without_repeated_disturbances
 
 _D2 = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
 
@@ -80,10 +81,19 @@ def existence_conditions(plant: DescriptorSystem, model: Exosystem) -> tuple[Con
 
 def existence(plant: DescriptorSystem, model: Exosystem, *, exactly: bool = True) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
-    judge = Evaluator(plant.dense(), exactly)
-    outcome = reconsidered(judge, lambda judge: _decided(judge, model), lambda each: each.conditions)
+    dense = plant.dense()
+    fewer = without_repeated_disturbances(dense)
+    outcome = _examined(dense if fewer is None else fewer, model, exactly)
+    if fewer is not None:
+        # A plant without its algebraic states is one with all unknown inputs.
+        as_given = outcome.transformation is None
+        outcome = replace(outcome, plant=dense) if as_given else _examined(dense, model, exactly)
     _condition_cache(plant)[_cache_key(model, exactly=exactly)] = outcome.conditions
     return outcome
+
+
+def _examined(plant: DescriptorSystem, model: Exosystem, exactly: bool) -> Existence:
+    return reconsidered(Evaluator(plant, exactly), lambda judge: _decided(judge, model), lambda each: each.conditions)
 
 
 def _cache_key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
