@@ -35,6 +35,14 @@ def test_a_multiple_takes_no_design_away_and_is_decoupled(method: str, factor: f
     assert np.max(np.abs(estimates / [1.0, factor])) < 1e-9
 
 
+@pytest.mark.parametrize("options", [{}, {"decay": 0.5}, {"joint": True}])
+@pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0, 7e4])
+def test_a_multiple_that_outputs_show_takes_no_design_away(factor: float, options: dict[str, float]) -> None:
+    direct = np.outer([0.4531, -1.207], [1.0, factor])
+    plant = plant_with([1.0, factor], 0.0).replace(Dd=direct, Dw=0.1 * np.eye(2), Bw=None, noise_names=None)
+    assert obsynth.ui_pi_observer(plant, **options).report.passed
+
+
 def test_unknown_inputs_that_differ_are_all_there() -> None:
     assert without_repeated_disturbances(plant_with([1.0], 0.0)) is None
     two = plant_with([1.0, 3.0], 0.0)
