@@ -211,11 +211,16 @@ def rank_revealing_step(
     ``terms`` of the same shape as Y say how large the terms are that Y is a sum of, by default Y itself: what vanishes
     is judged beside them."""
     n, S = H.shape[1], S[:, S.any(axis=0)]
-    lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
-    rank = len(head)
     columns, sizes = Y.shape[1], np.abs(Y) if terms is None else terms
     if rounding is not None:
         Y = np.hstack([Y, rounding.root, np.eye(len(H))])
+    says = H.any(axis=1) | S.any(axis=1) | unknown.any(axis=1)
+    if not says.all():
+        # Of an equation 0 = 0 rounding would make one of the others, with noise of that size.
+        _require_vanishing(Y[~says, mapped:columns], sizes[~says, mapped:], mapped)
+        H, S, Y, sizes, unknown = (part[says] for part in (H, S, Y, sizes, unknown))
+    lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
+    rank = len(head)
     innovation, carried, noise_left, vanishing = _whitened(q1, q2, S, Y, sizes[:, mapped:], mapped)
     noise = _triangle(noise_left.T)[: min(noise_left.shape)].T if noise_left.size else np.zeros((rank, 0))
     solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
@@ -341,14 +346,19 @@ def _whitened(
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     made_of = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
-    vanishing = remainder[:, mapped : mapped + terms.shape[1]]
-    if mapped:
-        no_mean = np.zeros((len(remainder), 1))
-        vanishing, made_of = np.hstack([no_mean, vanishing]), np.hstack([no_mean, made_of])
-    _require_consistent(vanishing, made_of)
+    _require_vanishing(remainder[:, mapped : mapped + terms.shape[1]], made_of, mapped)
     rotated = q1.T @ S @ z
     signs = np.sign(np.diagonal(lower))[:, None]
     return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:], remainder
+
+
+def _require_vanishing(remainder: FloatArray, terms: FloatArray, mapped: int) -> None:
+    """Raise `PreconditionError` where data without noise do not vanish beside their terms; none of them belongs to the
+    mean where earlier columns are mapped."""
+    if mapped:
+        no_mean = np.zeros((len(remainder), 1))
+        remainder, terms = np.hstack([no_mean, remainder]), np.hstack([no_mean, terms])
+    _require_consistent(remainder, terms)
 
 
 def _require_consistent(remainder: FloatArray, terms: FloatArray) -> None:
