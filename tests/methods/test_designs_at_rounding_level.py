@@ -83,8 +83,8 @@ def drift_in_operation(design: obsynth.ObserverDesign, samples: int = 1000) -> f
 
 @pytest.mark.long
 def test_rounding_in_operation_under_a_constant_fault_is_limited() -> None:
-    """To 1e-11 in exact arithmetic, and 1e4 of the fault off as it runs: such an observer is refused."""
-    good, bad = chain(4, 0.3, 0.5), plant_of(1048)
+    """Right to 1e-13 in exact arithmetic, and without a bound on what rounding does as it runs: that is refused."""
+    good, bad = chain(4, 0.3, 0.5), plant_of(1213)
     ordinary = ui_pi_observer(good)
     assert drift_in_operation(ordinary) <= ordinary.report["constant fault"].value < 1e-9
     with pytest.raises(VerificationError, match="was tried with its defaults and is verified for this plant") as error:
@@ -115,7 +115,7 @@ def test_what_is_verified_is_right_in_operation(seed: int) -> None:
 
 @pytest.mark.long
 def test_where_no_method_is_right_at_constant_faults_none_is_named() -> None:
-    plant = plant_of(1189)
+    plant = plant_of(1180)
     with pytest.raises(VerificationError, match="No other method that estimates faults is verified") as error:
         ui_pi_observer(plant)
     assert {row.name for row in error.value.report.failures} == {"constant fault"}

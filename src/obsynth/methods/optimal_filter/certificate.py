@@ -26,8 +26,9 @@ from obsynth.verification.invisible_faults import Setting, proved_least, proved_
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
-#: More of them for a gain that is below this share of what the noise could do in a sample, whatever cancels.
-SMALL_GAIN, SMALL_GAIN_ROOMS = 1e-4, np.geomspace(2.0, 1e6, 20)
+#: More of them for a gain that is at most so many times what counts as zero, up to this share of what the noise could
+#: do in a sample, whatever cancels.
+NEARLY_NOTHING, SMALL_GAIN, SMALL_GAIN_ROOMS = 1e4, 1e-4, np.geomspace(2.0, 1e6, 20)
 #: At so many of them all eigenvalues of the Hamiltonian matrix are enclosed, in some tenths of a second each.
 MOST_ENCLOSURES = 5
 #: Levels that are claimed of a gain that is zero but for rounding, in units of what counts as zero.
@@ -70,8 +71,9 @@ def certified(
         levels = [factor * chosen.nothing for factor in ZERO_LEVELS]
     else:
         levels = [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
-    # A gain far below what the noise could do may be lost in the stored numbers, which have a larger one then.
-    levels += [float(level) for level in levels[-1] * SMALL_GAIN_ROOMS if level <= SMALL_GAIN * channel.size]
+    if chosen.gain <= NEARLY_NOTHING * chosen.nothing:
+        # The gain may be lost in the stored numbers, which have a larger one then.
+        levels += [float(level) for level in levels[-1] * SMALL_GAIN_ROOMS if level <= SMALL_GAIN * channel.size]
     matrices: dict[str, FloatArray] = {}
     for number, level in enumerate(levels):
         P = gain_matrix(channel, level, plant.dt, chosen.problem.alpha)
