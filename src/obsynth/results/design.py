@@ -340,3 +340,10 @@ def require_verified(design: ObserverDesign, *, unverified: bool = False) -> Non
         "Design it again, or allow it (--unverified, unverified=True): every file that is written then says so.",
         report=report,
     )
+
+
+def describe_parameters(result: type[ObserverDesign]) -> None:
+    """Give a kind of design the parameters of every design in its docstring, before its examples."""
+    summary, header, examples = (result.__doc__ or "").partition("Examples\n")
+    parameters = (ObserverDesign.__doc__ or "").partition("\n")[2].partition("Examples\n")
+    result.__doc__ = summary.rstrip(" ") + parameters[0] + "".join((header, examples) if header else parameters[1:])

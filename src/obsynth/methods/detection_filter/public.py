@@ -8,7 +8,7 @@ from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
 from obsynth.methods.verifying import verify
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import ObserverDesign, describe_parameters
 from obsynth.results.verification_report import VerificationReport
 
 
@@ -67,6 +67,6 @@ class DetectionFilter(ObserverDesign):
 
 
 # Its parameters are those of every design.
-DetectionFilter.__doc__ = (DetectionFilter.__doc__ or "") + (ObserverDesign.__doc__ or "").partition("\n")[2]
+describe_parameters(DetectionFilter)
 
 detection_filter = design_function(DetectionFilterMethod, DetectionFilter)

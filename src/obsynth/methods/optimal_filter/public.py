@@ -10,7 +10,7 @@ from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import design_function
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.numerics.arguments import arguments_checked
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import ObserverDesign, describe_parameters
 from obsynth.results.layout import number
 from obsynth.results.registered import registered
 
@@ -126,6 +126,6 @@ class OptimalFilter(ObserverDesign):
 
 
 # Its parameters are those of every design.
-OptimalFilter.__doc__ = (OptimalFilter.__doc__ or "") + (ObserverDesign.__doc__ or "").partition("\n")[2]
+describe_parameters(OptimalFilter)
 
 optimal_filter = design_function(OptimalFilterMethod, OptimalFilter)
