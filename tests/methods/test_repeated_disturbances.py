@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cvxpy
 import numpy as np
 import pytest
 
@@ -41,6 +42,17 @@ def test_a_multiple_that_outputs_show_takes_no_design_away(factor: float, option
     direct = np.outer([0.4531, -1.207], [1.0, factor])
     plant = plant_with([1.0, factor], 0.0).replace(Dd=direct, Dw=0.1 * np.eye(2), Bw=None, noise_names=None)
     assert obsynth.ui_pi_observer(plant, **options).report.passed
+
+
+@pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0])
+def test_the_inequality_as_it_is_solved_is_that_of_the_independent_ones(factor: float) -> None:
+    direct = np.outer([0.4531, -1.207], [1.0, factor])
+    plant = plant_with([1.0, factor], 0.0).replace(Dd=direct)
+    problem = obsynth.conditions.sharepasand(plant, region=obsynth.conditions.half_plane(0.3))
+    problem.problem.solve()
+    assert problem.design().report.passed
+    own = obsynth.ui_pi_observer(plant, decay=0.3, objective=lambda letters: cvxpy.Minimize(cvxpy.trace(letters["P"])))
+    assert own.report.passed
 
 
 def test_unknown_inputs_that_differ_are_all_there() -> None:

@@ -239,6 +239,17 @@ class ErrorModel:
         """Return ``T b - By d (nz, any)``: what drives e where a signal enters the plant by b and its outputs by d."""
         return np.asarray(self.own @ b - self.observer.By @ d)
 
+    def driven_at_most(self, b: FloatArray) -> FloatArray:
+        """Return what T could make of signals that enter the plant by ``b (nx, any)``, whatever cancels: ``(nz, any)``.
+
+        T holds no more digits of an equation than of the row's largest one: where a signal enters, it may hold nothing
+        but rounding."""
+        if not self.observer.order:
+            return np.zeros((0, b.shape[1]))
+        equations = natural_scaling(self.plant).equations
+        rows = np.max(np.abs(self.own) / equations, axis=1, initial=0.0, keepdims=True)
+        return np.asarray(rows * np.max(equations[:, None] * np.abs(b), axis=0, initial=0.0))
+
     def output(self, rows: slice) -> Output:
         """Return ``C, Df, Dd, Dw`` of some rows, which are ``-C e + Df f + Dd d + Dw w`` (states: the error)."""
         plant, direct = self.plant, self.observer.Dy[rows]
@@ -304,16 +315,13 @@ class ErrorModel:
         )
 
     @cached_property
-    def _scaling(self) -> Scaling:
-        """Natural units of xa, and of the equations that it follows."""
-        if self.lag or self.Phi is not None:
-            return balance_by_least_squares(self.E, self.A, outputs=[self.C])
-        return natural_scaling(self.plant)
-
-    @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Natural units of xa ``(na,)``, and in these the largest terms of each row of z and of the outputs."""
-        size, observer, units = np.abs, self.observer, self._scaling.states
+        size, observer = np.abs, self.observer
+        if self.lag or self.Phi is not None:
+            units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
+        else:
+            units = natural_scaling(self.plant).states
         te, c = size(self.T) @ size(self.E), size(self.C)
         formed = size(observer.Az) @ te + size(observer.By) @ c + size(self.T) @ size(self.A)
         estimates = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
@@ -343,9 +351,6 @@ class ErrorModel:
             float(np.max(size(balls.midpoint) * units / terms, initial=0.0))
             for balls, terms in zip((channel.K, channel.J), rows, strict=True)
         ]
-        # T holds no more digits of an equation than of the row's largest one.
-        equations = self._scaling.equations
-        row_of_t = np.max(t / equations, axis=1, initial=0.0, keepdims=True) / rows[0]
         for balls, terms, b in (
             ((channel.U, channel.L), inputs, self.B),
             ((channel.W, channel.V), disturbances, self.Bd),
@@ -355,9 +360,8 @@ class ErrorModel:
                 np.vstack([part / row for part, row in zip(parts, rows, strict=True)])
                 for parts in ([size(part.midpoint) for part in balls], terms)
             )
-            signal = np.max(size(b) * equations[:, None], axis=0, initial=0.0)
-            possible = np.max(row_of_t, initial=0.0) * signal
-            scale = np.maximum(np.max(moved, axis=0, initial=0.0), LEAST_ROW * possible)
+            possible = self.driven_at_most(b[: self.plant.nx]) / rows[0]
+            scale = np.max(np.vstack([moved, LEAST_ROW * possible]), axis=0, initial=0.0)
             shares.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))
         if self.T0 is not None:
             largest = np.max(t0 @ size(self.E) * units, axis=1, initial=0.0, keepdims=True)

@@ -63,7 +63,7 @@ class Existence:
     """What was decided about a plant."""
 
     conditions: tuple[Condition, ...]  # after a failed (D2) there is no (D3); fixed modes come last
-    plant: DescriptorSystem  # as given, or without its algebraic states
+    plant: DescriptorSystem  # to design for: without unknown inputs that repeat others, or without algebraic states
     transformation: Transformation | None  # the elimination
     fixed_modes: ComplexArray  # poles of every such observer
 
@@ -84,12 +84,12 @@ def existence(plant: DescriptorSystem, model: Exosystem, *, exactly: bool = True
     dense = plant.dense()
     fewer = without_repeated_disturbances(dense)
     outcome = _examined(dense if fewer is None else fewer, model, exactly)
-    if fewer is not None:
+    if fewer is not None and outcome.transformation is not None:
         # A plant without its algebraic states is one with all unknown inputs.
-        as_given = outcome.transformation is None
-        outcome = replace(outcome, plant=dense) if as_given else _examined(dense, model, exactly)
+        outcome = _examined(dense, model, exactly)
     _condition_cache(plant)[_cache_key(model, exactly=exactly)] = outcome.conditions
-    return outcome
+    # What decouples the others decouples an unknown input that repeats them: rounding would make it one of its own.
+    return replace(outcome, plant=without_repeated_disturbances(outcome.plant) or outcome.plant)
 
 
 def _examined(plant: DescriptorSystem, model: Exosystem, exactly: bool) -> Existence:

@@ -15,7 +15,7 @@ from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed
-from obsynth.verification.error_system import ErrorModel, natural_scaling
+from obsynth.verification.error_system import ErrorModel
 
 #: What passes directly to the error is rounding below so many bounds on the rounding of its terms.
 ROUNDED_UNITS = 1e4
@@ -51,12 +51,7 @@ class ErrorChannel:
         """What the noise could do to the error in a sample, whatever cancels."""
         model = self.model
         observer, plant = model.observer, model.plant
-        own = np.abs(observer.By) @ np.abs(plant.Dw)
-        if len(model.own):
-            # T may hold nothing but rounding where the noise enters: of its rows the largest entries count.
-            equations = natural_scaling(plant).equations
-            rows_of_t = np.max(np.abs(model.own) / equations, axis=1, keepdims=True)
-            own = own + rows_of_t * np.max(equations[:, None] * np.abs(plant.Bw), axis=0, initial=0.0)
+        own = model.driven_at_most(plant.Bw) + np.abs(observer.By) @ np.abs(plant.Dw)
         direct = np.abs(observer.Dy) @ np.abs(plant.Dw)
         if model.T0 is not None:
             direct = direct + np.abs(model.T0[:, : plant.nx]) @ np.abs(plant.Bw)

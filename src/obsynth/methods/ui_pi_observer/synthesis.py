@@ -35,7 +35,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
-from obsynth.plants.transformations.repeated_disturbances import without_repeated_disturbances
 
 #: Rates below this, in 1/s, are those of an observer that does not settle.
 SLOWEST = 1e-300
@@ -112,8 +111,6 @@ def synthesise(
     progress("checking the existence conditions")
     known = existence(plant, model)
     require_all_conditions(known.conditions)
-    # What decouples the others decouples an unknown input that repeats them: rounding would make it one of its own.
-    known = replace(known, plant=without_repeated_disturbances(known.plant) or known.plant)
     working = known.plant
     progress("decoupling the unknown inputs")
     paper_matrices = method.given_decoupling()
