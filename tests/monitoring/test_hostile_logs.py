@@ -269,3 +269,17 @@ def test_a_sensor_that_is_never_measured_is_named_where_others_suffice(folder: P
     run = obsynth.run_on_data(obsynth.load(folder / "kalman.json"), log)
     assert run.statuses["partial"] >= ROWS - 1
     assert any("'T1' is never measured" in text for text in run.warnings)
+
+
+def test_two_signals_may_be_read_from_one_column(folder: Path) -> None:
+    design = obsynth.load(folder / "linear.json")
+    rows = with_cell("inf", "T2")[1:]
+    log = pd.DataFrame([[float(cell) for cell in row] for row in rows], columns=list(HEADER))
+    run = obsynth.run_on_data(design, log, columns={"T1": "T2"})
+    assert run.rows == ROWS
+    assert [text for text in run.warnings if "infinite" in text] == [INFINITE.replace("T1", "T2")]
+    log["T2"] = 3.0
+    texts = obsynth.run_on_data(design, log, columns={"T1": "T2"}).warnings
+    assert [text.split(":")[0] for text in texts if "in all" in text] == [
+        f"{name} is 3 in all {ROWS} rows" for name in ("T1", "T2")
+    ]

@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError, counted
 from obsynth.methods.fault_figures import on_the_clock
 from obsynth.monitoring.logs.log_tables import log_table
-from obsynth.monitoring.logs.measured_columns import CONSTANT_ROWS, constant_text, never_measured
+from obsynth.monitoring.logs.measured_columns import constant_texts, never_measured
 from obsynth.monitoring.logs.signals import TIME_HEADER, missing_columns
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.monitoring.logs.unpacked_logs import as_frame
@@ -143,19 +143,11 @@ class ComparedLog:
         stamps = table.get(time)
         stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
         times = _clock(count, plant.dt) if stamps is None else stamps
-        notes = [*remarks, *stuck_texts(stuck), *_constant_texts({name: frame[name] for name in plant.output_names})]
+        ranges = [(name, float(np.nanmin(frame[name])), float(np.nanmax(frame[name]))) for name in plant.output_names]
+        notes = [*remarks, *stuck_texts(stuck), *constant_texts(ranges, count)]
         if stamps is None:
             notes.append(f"The log has no column {time!r}: its rows are taken as {plant.dt:g} s apart.")
         return Record(times, u, y, truth, tuple(known_faults), tuple(notes))
-
-
-def _constant_texts(outputs: Mapping[str, FloatArray]) -> list[str]:
-    """Return what is to be said of outputs ``(rows,)`` that hold one number in all of many rows."""
-    return [
-        constant_text(name, float(np.nanmax(values)), len(values))
-        for name, values in outputs.items()
-        if len(values) >= CONSTANT_ROWS and np.nanmin(values) == np.nanmax(values)
-    ]
 
 
 def _outputs(

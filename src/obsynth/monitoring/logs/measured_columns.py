@@ -30,12 +30,12 @@ class MeasuredColumns:
 
     def take(self, chunk: FloatArray, columns: Sequence[str], formed: Collection[int] = ()) -> None:
         """Take rows of time and signals ``(n, 1 + columns)``, and make what is infinite in them missing; columns that
-        are ``formed`` from others hold nothing of their own."""
+        are ``formed`` from others hold nothing of their own, and those that several signals share count once."""
         before, self.rows = self.rows, self.rows + len(chunk)
         values = chunk[:, 1:]
         infinite = np.isinf(values)
         for place in np.flatnonzero(infinite.any(axis=0)).tolist():
-            if place + 1 not in formed:
+            if place + 1 not in formed and columns.index(columns[place]) == place:
                 rows = np.flatnonzero(infinite[:, place])
                 count, first = self._infinite.get(columns[place], (0, before + int(rows[0]) + 1))
                 self._infinite[columns[place]] = count + len(rows), first
@@ -45,25 +45,18 @@ class MeasuredColumns:
             low, high = np.fmin(low, self._low), np.fmax(high, self._high)
         self._low, self._high = low, high
 
-    def constant(self, columns: Sequence[str]) -> dict[str, float]:
-        """Return the columns that hold one and the same number in all of many rows, and it."""
-        if self.rows < CONSTANT_ROWS:
-            return {}
-        both = zip(columns, self._low.tolist(), self._high.tolist(), strict=True)
-        return {name: low for name, low, high in both if low == high}
+    def empty(self, signals: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Return those columns, each with its signal, in which no row has held a finite number."""
+        return [pair for pair, low in zip(signals, self._low, strict=False) if np.isnan(low)]
 
-    def empty(self, columns: Sequence[str]) -> list[str]:
-        """Return the columns in which no row has held a finite number."""
-        return [name for name, low in zip(columns, self._low, strict=False) if np.isnan(low)]
-
-    def notes(self, signals: Mapping[str, str], inputs: int) -> list[str]:
-        """Return texts for columns of ``signals``, of which the first are ``inputs``, that hold nothing, and for
+    def notes(self, signals: Sequence[tuple[str, str]], inputs: int) -> list[str]:
+        """Return texts for columns, each with its signal, of which the first are ``inputs``, that hold nothing, and for
         outputs that hold one number."""
-        outputs = list(signals)[inputs:]
-        constant = self.constant(list(signals))
+        names = [signal for _, signal in signals]
+        ranges = list(zip(names, self._low.tolist(), self._high.tolist(), strict=False))
         return [
-            *(never_measured(column, signals[column]) for column in self.empty(list(signals))),
-            *(constant_text(signals[column], constant[column], self.rows) for column in outputs if column in constant),
+            *(never_measured(column, signal) for column, signal in self.empty(signals)),
+            *constant_texts(ranges[inputs:], self.rows),
         ]
 
     def warnings(self) -> list[str]:
@@ -82,9 +75,16 @@ def never_measured(column: str, signal: str) -> str:
     )
 
 
-def constant_text(signal: str, value: float, rows: int) -> str:
-    """Return what is to be said of an output that holds one number in all rows."""
-    return f"{signal} is {value:.6g} in all {rows} rows: its sensor may be stuck, or not connected."
+def constant_texts(ranges: Sequence[tuple[str, float, float]], rows: int) -> list[str]:
+    """Return what is to be said of outputs, each with its smallest and its largest number, that hold one in all rows,
+    where these are many."""
+    if rows < CONSTANT_ROWS:
+        return []
+    return [
+        f"{signal} is {low:.6g} in all {rows} rows: its sensor may be stuck, or not connected."
+        for signal, low, high in ranges
+        if low == high
+    ]
 
 
 def mostly_missing(rows: FloatArray, signals: Mapping[str, int]) -> str:

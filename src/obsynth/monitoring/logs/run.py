@@ -356,7 +356,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
             *run.observer.notes,
             *stamps.warnings(),
             *run.first.warnings(),
-            *stamps.measured.notes(run.signals.signals_of_columns(), run.signals.inputs),
+            *stamps.measured.notes(run.signals.columns_and_signals(), run.signals.inputs),
             *start,
             *stuck_texts(stuck),
         ),
@@ -399,10 +399,10 @@ def _require_a_window(design: ObserverDesign, rows: int) -> None:
 
 def _require_estimates(run: LogRun, stamps: Stamps) -> None:
     """Raise `SpecError` where no row of a log has an estimate, as a column of it is empty."""
-    signals = run.signals.signals_of_columns()
-    empty = stamps.measured.empty(list(signals))
+    empty = stamps.measured.empty(run.signals.columns_and_signals())
     if empty and not run.statuses.keys() - {GAP, *STALE}:
-        raise SpecError(never_measured(empty[0], signals[empty[0]]), path=f"columns.{signals[empty[0]]}")
+        column, signal = empty[0]
+        raise SpecError(never_measured(column, signal), path=f"columns.{signal}")
 
 
 def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:

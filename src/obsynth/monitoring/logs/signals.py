@@ -158,7 +158,7 @@ class LogSignals:
             matches[i] = matches[i] if base is None else matches[self.columns.index(base[0])]
         missing = sorted({name for name, present in zip(self.columns, matches, strict=True) if present is None})
         if missing:
-            raise missing_columns(header, missing, self.signals_of_columns())
+            raise missing_columns(header, missing, dict(self.columns_and_signals()))
         present = [name for name in matches if name is not None]
         repeated = sorted({name for name in present if header.count(name) > 1})
         if repeated:
@@ -168,9 +168,9 @@ class LogSignals:
             )
         return [header.index(name) for name in present]
 
-    def signals_of_columns(self) -> dict[str, str]:
-        """Return the signal of each column that is read, but the time."""
-        return dict(
+    def columns_and_signals(self) -> list[tuple[str, str]]:
+        """Return each column that is read, but the time, with its signal; several signals may share a column."""
+        return list(
             zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.constant_signal), strict=True)
         )
 

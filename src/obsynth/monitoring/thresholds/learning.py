@@ -277,7 +277,7 @@ class _NormalLogs:
 
     def missing(self, signals: LogSignals) -> str:
         """Return which signals many rows are without, as a sentence; empty where there are none."""
-        return mostly_missing(self.rows, {name: i for i, name in enumerate(signals.signals_of_columns().values(), 1)})
+        return mostly_missing(self.rows, {name: i for i, (_, name) in enumerate(signals.columns_and_signals(), 1)})
 
     def slices_of(self, numbers: NDArray[np.int64]) -> tuple[slice, ...]:
         """Return for each log which of some ascending row numbers are its own."""
@@ -531,7 +531,7 @@ def _notes_of_cells(logs: Sequence[Stamps], signals: LogSignals) -> list[str]:
     return [
         f"Log {number}: {text}" if len(logs) > 1 else text
         for number, stamps in enumerate(logs, 1)
-        for text in (*stamps.warnings(), *stamps.measured.notes(signals.signals_of_columns(), signals.inputs))
+        for text in (*stamps.warnings(), *stamps.measured.notes(signals.columns_and_signals(), signals.inputs))
     ]
 
 
