@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.logs.stamps import UNITS_OF_TIME
 
 #: Rows whose stamps do not rise: they are left out, and say nothing.
 REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
@@ -45,9 +46,6 @@ GAP_FACTOR = 10.0
 MOST_COUNTED_SAMPLES = 2.0**53
 
 
-#: Units in which stamps may be that are taken as seconds, and how many seconds one of theirs is then taken for.
-TIME_UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600, "d": 1 / 86400}
-
 #: An interval is taken for one in another unit where it is off that by this share at most, as stamps jitter.
 UNIT_SHARE = 0.05
 
@@ -58,7 +56,8 @@ SORTED = "Sort the log by its time; if logs were joined, give each by itself"
 def unit_advice(samples: float) -> str:
     """Return what helps where rows are so many samples apart as they are with stamps in another unit than seconds, as a
     sentence with a blank before it; empty where no unit fits."""
-    fits = [unit for unit, size in TIME_UNITS.items() if abs(samples / size - 1.0) <= UNIT_SHARE]
+    others = {unit: size for unit, size in UNITS_OF_TIME.items() if size != 1.0}
+    fits = [unit for unit, size in others.items() if abs(samples / size - 1.0) <= UNIT_SHARE]
     return f" If the stamps are in {fits[0]}, call their column 'time [{fits[0]}]'." if fits else ""
 
 

@@ -76,8 +76,9 @@ LEAST_FALL, AUTUMN_FALL = 1800.0, 3600.0
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
-#: What the unit of the time may be called in a line of units, and how many of them are a second; empty: seconds.
-_UNITS_OF_TIME = {
+#: What the unit of the time may be called in a line of units, and how many of them are a second, the usual name of each
+#: first; empty: seconds.
+UNITS_OF_TIME = {
     **dict.fromkeys(("", "-", "s", "sec", "secs", "second", "seconds", "sek"), 1.0),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e3),
     **dict.fromkeys(("us", *(f"{sign}s" for sign in MICRO_SIGNS), "usec", "microsecond", "microseconds"), 1e6),
@@ -160,7 +161,7 @@ def zone_of(name: str) -> tzinfo:
 
 def _per_second(unit: str) -> float:
     """Return how many of a unit of time are a second."""
-    count = _UNITS_OF_TIME.get(str(unit).strip().lower()) if str(unit).strip() else None
+    count = UNITS_OF_TIME.get(str(unit).strip().lower()) if str(unit).strip() else None
     if count is None:
         raise SpecError(
             f"{unit!r} is no unit of time: give one of s, ms, us, ns, min, h, d (or days).", path="time_unit"
@@ -258,7 +259,7 @@ class Stamps:
     def take_header(self, header: Sequence[str], wanted: Sequence[str], places: Sequence[int]) -> None:
         """Take the units that stand behind names of columns, which are called otherwise where they are ``wanted``."""
         match = WITH_UNIT.fullmatch(header[places[0]])
-        per_second = None if match is None else _UNITS_OF_TIME.get(match.group(2).strip().lower())
+        per_second = None if match is None else UNITS_OF_TIME.get(match.group(2).strip().lower())
         if per_second is not None:
             self._take_unit(per_second, header[places[0]])
         for i, name in enumerate(wanted):
@@ -297,7 +298,7 @@ class Stamps:
         if not cells or not any(cells) or any(map(_is_number, cells)):
             return False
         unit = cells[0].strip("[]()").lower()
-        per_second = _UNITS_OF_TIME.get(unit)
+        per_second = UNITS_OF_TIME.get(unit)
         if per_second is None or not any(cell.lower() not in MISSING_TEXTS for cell in cells):
             return False
         if unit:
