@@ -11,6 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.c_source import (
     alarm_comments,
+    alarm_fields,
     comment,
     filled_table,
     filled_template,
@@ -92,13 +93,7 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: 
         *alarms.struct_lines(prefix),
         "typedef struct {",
         comment("Read these after a step: what the row was, and which outputs passed their levels (if OK)."),
-        "    int status;",
-        f"    int alarm[{max(len(alarms.levels), 1)}];",
-        "    int any_alarm;",
-        comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
-        f"    REAL level[{max(len(alarms.levels), 1)}];",
-        "    double warm_up;",
-        *([] if alarms.monitor is None else [f"    {prefix}_monitor monitor;"]),
+        *alarm_fields(alarms, prefix),
         comment("Everything else is the observer's own."),
         f"    REAL z[{max(observer.order, 1)}], weights[{observer.count}];",
         f"    REAL parameters[{len(observer.scheduling.names)}];",

@@ -175,6 +175,20 @@ def alarm_comments(alarms: Alarms) -> list[str]:
     return lines
 
 
+def alarm_fields(alarms: Alarms, prefix: str) -> list[str]:
+    """Return what a state says of a row and its alarms, as C declares it."""
+    watched = max(len(alarms.levels), 1)
+    return [
+        "    int status;",
+        f"    int alarm[{watched}];",
+        "    int any_alarm;",
+        comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
+        f"    REAL level[{watched}];",
+        "    double warm_up;",
+        *([] if alarms.monitor is None else [f"    {prefix}_monitor monitor;"]),
+    ]
+
+
 def _state_struct(realisation: Realisation, prefix: str, alarms: Alarms) -> list[str]:
     """Return what the observer remembers, as C declares it."""
     observer, gap = realisation.observer, realisation.gap
@@ -198,18 +212,11 @@ def _state_struct(realisation: Realisation, prefix: str, alarms: Alarms) -> list
         "carried": compared,
         "grown": compared,
     }
-    watched = max(len(alarms.levels), 1)
     return [
         *alarms.struct_lines(prefix),
         "typedef struct {",
         comment("Read these after a step: what the row was, and which outputs passed their levels."),
-        "    int status;",
-        f"    int alarm[{watched}];",
-        "    int any_alarm;",
-        comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
-        f"    REAL level[{watched}];",
-        "    double warm_up;",
-        *(f"    {prefix}_monitor monitor;" for _ in ("monitor",) if alarms.monitor is not None),
+        *alarm_fields(alarms, prefix),
         comment("Everything else is the observer's own."),
         *(f"    REAL {name}[{max(size, 1)}];" for name, size in sizes.items()),
         "    double time, from, waiting;",
