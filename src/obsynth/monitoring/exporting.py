@@ -3,6 +3,7 @@ tolerances."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,15 +52,10 @@ class LearnedMonitorInC:
     @property
     def variables(self) -> tuple[MonitorVariable, ...]:
         """The statistic, the fault that an alarm points to, and whether an alarm lasts."""
-        listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(self.fault_names))
         held = f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"
         return (
             MonitorVariable(STATISTIC, f"largest statistic in units of its level: {self.statement}", "statistic"),
-            MonitorVariable(
-                "isolated",
-                f"number of the fault of the plant that an alarm points to, 0 for none ({listed})",
-                "fault + 1.0",
-            ),
+            _isolated(self.fault_names),
             MonitorVariable("event", held, "event"),
         )
 
@@ -180,14 +176,9 @@ class RegionMonitorInC:
     @property
     def variables(self) -> tuple[MonitorVariable, ...]:
         """The norm of the residual in units of its threshold, and the fault that an alarm points to."""
-        listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(self.fault_names))
         return (
             MonitorVariable(STATISTIC, f"norm of the residual by its threshold: {self.statement}", "statistic"),
-            MonitorVariable(
-                "isolated",
-                f"number of the fault of the plant that an alarm points to, 0 for none ({listed})",
-                "fault + 1.0",
-            ),
+            _isolated(self.fault_names),
         )
 
     def watched_observer(self, observer: Any) -> Any:
@@ -223,6 +214,14 @@ class RegionMonitorInC:
             *table_lines("monitor_scales", filled_table(self.fault_scales[None])),
         ]
         return "\n".join(lines) + filled_template("region_threshold.c", prefix, {}, "obsynth.monitoring")
+
+
+def _isolated(fault_names: Sequence[str]) -> MonitorVariable:
+    """Return the fault that an alarm points to, by its number."""
+    listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(fault_names))
+    return MonitorVariable(
+        "isolated", f"number of the fault of the plant that an alarm points to, 0 for none ({listed})", "fault + 1.0"
+    )
 
 
 def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC | RegionMonitorInC | None:
