@@ -131,6 +131,16 @@ def rounding_rank(matrix: FloatArray) -> int:
     return int(np.linalg.matrix_rank(matrix))
 
 
+def first_independent(directions: FloatArray, count: int) -> list[int]:
+    """Return which rows, of unit length or zero, are the first that are independent to working precision, ``count`` of
+    them at most."""
+    picked: list[int] = []
+    for place in range(len(directions)):
+        if len(picked) < count and rounding_rank(directions[[*picked, place]]) > len(picked):
+            picked.append(place)
+    return picked
+
+
 def independent_directions(rows: FloatArray) -> FloatArray:
     """Return the directions ``(m, r)`` of rows ``(n, m)`` of unit deviations, of which some may be NaN, that do not
     follow from each other: the signals themselves where none does."""

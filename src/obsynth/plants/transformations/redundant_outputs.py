@@ -16,7 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.ranks import NEARLY_DEPENDENT, but_rounding, product_but_rounding, rounding_rank
+from obsynth.numerics.ranks import (
+    NEARLY_DEPENDENT,
+    but_rounding,
+    first_independent,
+    product_but_rounding,
+    rounding_rank,
+)
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -117,10 +123,7 @@ def _independent(output_rows: FloatArray) -> tuple[list[int], FloatArray, bool]:
 def _first_independent(units: FloatArray, count: int) -> list[int]:
     """Return the first rows that are independent within rounding: a sensor that is added changes no choice; where
     rounding leaves fewer than ``count``, the most independent ones."""
-    picked: list[int] = []
-    for place in range(len(units)):
-        if len(picked) < count and rounding_rank(units[[*picked, place]]) > len(picked):
-            picked.append(place)
+    picked = first_independent(units, count)
     return picked if len(picked) == count else _most_independent(units, count)
 
 

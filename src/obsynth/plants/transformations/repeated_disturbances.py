@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.numerics.arrays import remembered
-from obsynth.numerics.ranks import rounding_rank
+from obsynth.numerics.ranks import first_independent
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -28,10 +28,7 @@ def without_repeated_disturbances(plant: DescriptorSystem) -> DescriptorSystem |
     columns = np.vstack([units.equations[:, None] * plant.Bd, units.outputs[:, None] * plant.Dd])
     lengths = np.linalg.norm(columns, axis=0)
     directions = columns / np.where(lengths > 0.0, lengths, 1.0)
-    picked = list[int]()
-    for place in range(plant.nd):
-        if rounding_rank(directions[:, [*picked, place]]) > len(picked):
-            picked.append(place)
+    picked = first_independent(directions.T, plant.nd)
     if len(picked) in (0, plant.nd):
         return None
     names = [plant.disturbance_names[place] for place in picked]
