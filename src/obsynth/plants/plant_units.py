@@ -221,8 +221,8 @@ def _units_of(plant: DescriptorSystem) -> tuple[PlantUnits, bool]:
     units = PlantUnits._balanced(plant, None)
     if plant.is_discrete:
         by_steps = PlantUnits._balanced(plant, None, by_steps=True)
-        steps = by_steps.equations[:, None] * step_change(plant.E, plant.A) * by_steps.states
-        if moves_by_steps(steps[plant.E.any(axis=1)]) and units.apart(by_steps) > FAR_UNITS:
+        change = step_change(plant.E, plant.A)
+        if moves_by_steps(plant.E, change, by_steps.equations, by_steps.states) and units.apart(by_steps) > FAR_UNITS:
             return by_steps, True
     return units, False
 
@@ -233,9 +233,10 @@ def step_change(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.where(np.abs(change) > STEP_ROUNDING * np.abs(before), change, 0.0)
 
 
-def moves_by_steps(steps: FloatArray) -> bool:
-    """Return whether what a step changes, in units in which all of it is alike, is a share of the states that a
-    sampling time would make of them."""
+def moves_by_steps(E: FloatArray, change: FloatArray, rows: FloatArray, columns: FloatArray) -> bool:
+    """Return whether what a step changes ``(m, n)``, in units of rows and columns in which all of it is alike, is a
+    share of the states that a sampling time would make of them; rows without E are no steps."""
+    steps = (rows[:, None] * change * columns)[E.any(axis=1)]
     return bool(np.max(np.abs(steps), initial=0.0) > LEAST_STEP)
 
 

@@ -40,10 +40,9 @@ class PencilUnits:
         if sampled and A.size:
             change = step_change(E, A)
             by_steps = cls._balanced(E, change)
-            moving = E.any(axis=1)
-            rows = np.where(moving, by_steps.rows * by_steps.time, by_steps.rows)
+            rows = np.where(E.any(axis=1), by_steps.rows * by_steps.time, by_steps.rows)
             apart = float(np.ptp(np.log2(by_steps.columns) - np.log2(units.columns)))
-            if moves_by_steps((rows[:, None] * change * by_steps.columns)[moving]) and apart > np.log2(FAR_UNITS):
+            if moves_by_steps(E, change, rows, by_steps.columns) and apart > np.log2(FAR_UNITS):
                 return cls(rows, by_steps.columns, 1.0)
         return units
 
