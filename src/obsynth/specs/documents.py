@@ -183,35 +183,40 @@ class DocumentProblems:
     source: Path
     what: str
     document: Any = None
-    noted: list[tuple[str, str]] = field(default_factory=list)
-    places: dict[str, tuple[str | int, ...]] = field(default_factory=dict)
+    noted: dict[tuple[str, str], Sequence[str | int]] = field(default_factory=dict)
 
     def add(self, path: str, text: str, location: Sequence[str | int] = ()) -> None:
         """Note that ``text`` is wrong at ``path``; ``location``: its keys, and numbers of entries, one by one."""
-        if (path, text) not in self.noted:
-            self.noted.append((path, text))
-            self.places[f"{path}: {text}"] = tuple(location) or tuple(path.split("."))
+        self.noted.setdefault((path, text), location or path.split("."))
+
+    def sort_by_section(self, sections: Sequence[str]) -> None:
+        """Put what was noted in the order of the sections of the document, unknown ones last."""
+        ordered = sorted(
+            self.noted.items(), key=lambda problem: (*sections, key := problem[0][0].partition(".")[0]).index(key)
+        )
+        self.noted.clear()
+        self.noted.update(ordered)
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with everything noted, if anything was."""
         if not self.noted:
             return
-        lines = self._numbered([f"{path}: {text}" if path else text for path, text in self.noted])
-        if len(lines) > MAXIMUM_PROBLEMS:
-            lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
+        lines = self._lines()
+        if len(self.noted) > MAXIMUM_PROBLEMS:
+            lines.append(f"and {len(self.noted) - MAXIMUM_PROBLEMS} more")
         head = f"{self.source} is not a valid {self.what}:"
-        raise SpecError(head, path=self.noted[0][0] or str(self.source), problems=lines)
+        raise SpecError(head, path=next(iter(self.noted))[0] or str(self.source), problems=lines)
 
-    def _numbered(self, problems: Sequence[str]) -> list[str]:
-        """Return problems with the line of the file that each is about, unless the document was changed after reading
-        it: what is wrong may then be no part of the file."""
+    def _lines(self) -> list[str]:
+        """Return the first problems with the line of the file that each is about, unless the document was changed after
+        reading it: what is wrong may then be no part of the file."""
         tree = composed(self.source)
         changed = tree is None or (self.document is not None and self.document != read_yaml(self.source))
-        lines = [None if changed else line_of(tree, self.places.get(problem, ())) for problem in problems]
-        return [
-            problem if line is None else f"{problem} [line {line}]"
-            for line, problem in zip(lines, problems, strict=True)
-        ]
+        lines = []
+        for (path, text), location in list(self.noted.items())[:MAXIMUM_PROBLEMS]:
+            line = None if changed or not path else line_of(tree, location)
+            lines.append((f"{path}: {text}" if path else text) + ("" if line is None else f" [line {line}]"))
+        return lines
 
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
@@ -254,8 +259,7 @@ def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -
         if value is not None or (name == "plant" and name in document):
             sections[name] = _validated(section_of(name, value), value, problems, prefix=name)
     # As if all had been checked at once: in the order of the keys of a spec, unknown ones last.
-    order = list(SpecDocument.model_fields)
-    problems.noted.sort(key=lambda problem: (*order, key := problem[0].partition(".")[0]).index(key))
+    problems.sort_by_section(list(SpecDocument.model_fields))
     if checked is None or None in sections.values():
         return None
     return checked.model_copy(update=sections)
