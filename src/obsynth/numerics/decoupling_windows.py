@@ -148,7 +148,7 @@ def estimation_problem(
     core = _core(a, (bw, dw), window, len(c))
     if reference is not None:
         # Where all inputs are taken later, the faults of now are those of some samples before.
-        reference = reference if exact else _late(reference, form.shift)
+        reference = reference if exact else with_late_inputs(reference, form.shift)
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
         core = _with_reference(core, reference, form.alpha if plant.dt == 0.0 else None, None if exact else newest)
     core = _without_unseen(core, modelled=plant.dt == 0.0 or reference is not None, continuous=plant.dt == 0.0)
@@ -191,7 +191,7 @@ def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int
     return lags, (a, delayed_b, c, direct)
 
 
-def _late(model: Model, samples: int) -> Model:
+def with_late_inputs(model: Model, samples: int) -> Model:
     """Return a model behind so many samples of delay of all its inputs."""
     a, b, c, d = model
     for _ in range(samples):
@@ -201,13 +201,20 @@ def _late(model: Model, samples: int) -> Model:
     return a, b, c, d
 
 
+def first_responses(model: Model, count: int) -> list[FloatArray]:
+    """Return what a model shows of an impulse in the first samples, one by one."""
+    a, b, c, d = model
+    responses, moved = [d][:count], b
+    while len(responses) < count:
+        responses.append(c @ moved)
+        moved = a @ moved
+    return responses
+
+
 def stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
     """Return the block Toeplitz matrix of a window from inputs to outputs."""
     rows, width = c.shape[0], b.shape[1]
-    toeplitz, moved, blocks = np.zeros((rows * (length + 1), width * (length + 1))), b, [d]
-    for _ in range(length):
-        blocks.append(c @ moved)
-        moved = a @ moved
+    toeplitz, blocks = np.zeros((rows * (length + 1), width * (length + 1))), first_responses((a, b, c, d), length + 1)
     for i in range(length + 1):
         for j in range(i + 1):
             toeplitz[i * rows : (i + 1) * rows, j * width : (j + 1) * width] = blocks[i - j]

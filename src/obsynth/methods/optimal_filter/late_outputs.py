@@ -1,4 +1,4 @@
-"""A sampled plant whose outputs come some samples late, and the delay that a filter puts before itself."""
+"""Whether a filter shows inputs of later samples, and a sampled plant whose outputs come some samples late."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.decoupling_windows import Model, first_responses
 from obsynth.numerics.standard_form import standard_form
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -27,22 +27,11 @@ def shows_later_inputs(plant: DescriptorSystem, filter_: Model) -> bool:
     e, a, c = equations * plant.E * units.states, equations * plant.A * units.states, outputs * plant.C * units.states
     form = standard_form(e, a, np.eye(plant.nx), c, np.zeros((plant.ny, plant.nx)), plant.dt)
     own = filter_[0], filter_[1] / units.outputs, filter_[2], filter_[3] / units.outputs
-    shown = _first_responses(in_series((form.A, form.B, form.C, form.D), own), form.shift)
+    shown = first_responses(in_series(form[:4], own), form.shift)
     sizes = [
-        sum(float(np.linalg.norm(part)) for part in _first_responses(model, form.shift))
-        for model in (own, (form.A, form.B, form.C, form.D))
+        sum(float(np.linalg.norm(part)) for part in first_responses(model, form.shift)) for model in (own, form[:4])
     ]
     return any(float(np.linalg.norm(part)) > LATER_SHARE * sizes[0] * sizes[1] for part in shown)
-
-
-def _first_responses(model: Model, count: int) -> list[FloatArray]:
-    """Return what a model shows of an impulse, sample by sample."""
-    a, b, c, d = model
-    responses, moved = [d][:count], b
-    while len(responses) < count:
-        responses.append(c @ moved)
-        moved = a @ moved
-    return responses
 
 
 def with_late_outputs(plant: DescriptorSystem, samples: int) -> DescriptorSystem:
@@ -71,9 +60,3 @@ def with_late_outputs(plant: DescriptorSystem, samples: int) -> DescriptorSystem
         disturbance_names=plant.disturbance_names,
         noise_names=plant.noise_names,
     )
-
-
-def output_delay(ny: int, samples: int) -> Model:
-    """Return the delay of all outputs by some samples."""
-    count = ny * samples
-    return np.eye(count, k=-ny), np.eye(count, ny), np.eye(ny, count, k=count - ny), np.zeros((ny, ny))

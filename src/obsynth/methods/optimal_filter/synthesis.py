@@ -32,14 +32,15 @@ from obsynth.methods.optimal_filter.lasting_modes import (
     with_growing_modes_reached,
     with_lasting_modes_driven,
 )
-from obsynth.methods.optimal_filter.late_outputs import output_delay, shows_later_inputs, with_late_outputs
+from obsynth.methods.optimal_filter.late_outputs import shows_later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order
 from obsynth.methods.optimal_filter.reference import plain
-from obsynth.methods.optimal_filter.weights import in_series, plain_weights
+from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.decoupling_windows import with_late_inputs
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import cayley, uncayley
@@ -119,7 +120,7 @@ def _with_late_outputs(plant: DescriptorSystem, options: OptimalFilterMethod) ->
     except PreconditionError:
         return None
     chosen = chosen._replace(
-        filter=in_series(output_delay(plant.ny, late), chosen.filter),
+        filter=with_late_inputs(chosen.filter, late),
         problem=replace(chosen.problem, shift=chosen.problem.shift + late),
         decays=least.decays,
         least=min(least.gain, chosen.gain) if options.norm == "h2" else None,
