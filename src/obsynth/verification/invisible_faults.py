@@ -24,9 +24,10 @@ import flint
 import numpy as np
 import scipy.linalg
 
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
-from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import structure_of
 from obsynth.verification.worst_invisible import Directions, Kernel, Model, Shown, Through, kernel, worst_directions
 
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
@@ -210,26 +211,20 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
 
 
 def has_index_one(plant: DescriptorSystem) -> bool:
-    """Whether every trajectory can be continued after now without inputs: ``rank [E A; 0 E] = n + rank E``."""
+    """Whether every trajectory can be continued after now without inputs."""
     return samples_after(plant) == 0
 
 
-@remembered
 def samples_after(plant: DescriptorSystem) -> int:
     """Return for how many samples after now the equations are to hold, so that a trajectory can be continued.
 
     None for index 1.  Beyond, states depend on inputs of some samples later: where the equations hold for as many
-    samples as the index, the states up to now are those of a whole trajectory without inputs after these.  The index
-    is the first k for which ``[E A; E A; .. E]`` with k + 1 rows has a rank of n more than with k.
+    samples as the index, the states up to now are those of a whole trajectory without inputs after these.
     """
-    n = plant.nx
-    ranks = [decide_rank(plant.E).rank]
-    for index in range(1, n + 1):
-        pencil = np.kron(np.eye(index + 1), plant.E) + np.kron(np.eye(index + 1, k=1), plant.A)
-        ranks.append(decide_rank(pencil).rank)
-        if ranks[-1] == n + ranks[-2]:
-            return index if index > 1 else 0
-    return n
+    index = structure_of(plant).index
+    if index is None:
+        return plant.nx
+    return index if index > 1 else 0
 
 
 def _grows(point: Any, plant: DescriptorSystem) -> bool:
