@@ -97,14 +97,15 @@ def missed_zeros(
 
     Each row is judged beside ``abs(M) abs(f)`` and how much that changes over the size of the zero.
     """
+    # Those of delays are at zero.
+    poles = np.zeros(1) if reference is None else np.linalg.eigvals(reference[0])
     missed = []
     for zero in unstable_fault_zeros(plant):
         if reference is None:
-            value, slope, distance = *_delayed(zero.value, delays or (0,) * plant.nf), abs(zero.value)
+            value, slope = _delayed(zero.value, delays or (0,) * plant.nf)
         else:
             value, slope = _modelled(zero.value, reference)
-            poles = np.linalg.eigvals(reference[0]) if len(reference[0]) else np.zeros(0)
-            distance = float(np.min(np.abs(zero.value - poles), initial=np.inf)) if len(poles) else 0.0
+        distance = float(np.min(np.abs(zero.value - poles))) if poles.size else 0.0
         rounding = float(ZERO_ROUNDING ** (1.0 / zero.multiplicity)) / VANISHING_SHARE
         scale = max(abs(zero.value), rounding * (abs(zero.value) + distance))
         missing = np.abs(value @ zero.faults)
