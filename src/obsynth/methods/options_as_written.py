@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.methods.method import Method
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import Transformation
@@ -22,9 +23,6 @@ from obsynth.plants.transformations.recovery import Transformation
 _OF_STATES = ("initial_state", "initial_covariance")
 
 _PATH = "method.options.Q"
-
-#: Entries of a covariance further apart than this share of the largest are not symmetric: the method says so.
-ASYMMETRY = 1e-8
 
 
 def method_for_proper_form(
@@ -66,11 +64,7 @@ def _of_size(value: Any, shape: tuple[int, ...]) -> FloatArray | None:
 
 def _arriving_noise(plant: DescriptorSystem, reduced: DescriptorSystem, q: FloatArray) -> FloatArray:
     """Return the covariance of what noise in the equations of a plant drives the free states with."""
-    size = float(np.max(np.abs(q), initial=0.0))
-    values, vectors = np.linalg.eigh(0.5 * (q + q.T))
-    if np.max(np.abs(q - q.T), initial=0.0) > ASYMMETRY * size or np.min(values, initial=0.0) < -ASYMMETRY * size:
-        raise SpecError("Q is not symmetric, or has negative eigenvalues: it is no covariance.", path=_PATH)
-    arriving = _driven(plant, reduced, vectors * np.sqrt(np.maximum(values, 0.0)))
+    arriving = _driven(plant, reduced, covariance_factor(q, "Q"))
     if arriving is not None:
         return arriving
     free = f"{reduced.nx} by {reduced.nx}, of {', '.join(reduced.state_names)}"
