@@ -14,7 +14,7 @@ PARTS = 4
 
 
 #: A case of these takes many seconds.
-LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers", "switched_regions"}
+LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers", "switched_regions", "switched_slopes"}
 NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in frame.campaign_names()]
 
 
