@@ -180,3 +180,14 @@ def test_the_order_and_the_units_of_parameters_change_no_point(seed: int) -> Non
         (plant({"v": [-factor, factor], "w": [0, 2]}, f"(v / {factor!r})"), point[0] * factor),
     ):
         assert pytest.approx(expected, rel=1e-12, abs=1e-12) == other.at({"v": v, "w": point[1]}).A
+
+
+def test_a_point_that_is_not_a_number_is_refused_by_name() -> None:
+    """The weights were NaN themselves, beside a refusal by `at`, which called NaN outside the region."""
+    with pytest.raises(SpecError, match="weight2 is NaN"):
+        PolytopicSystem([_pendulum().vertices[0]] * 2).scheduling.weights([0.5, np.nan])
+    pendulum = _pendulum()
+    point = {name: np.nan for name in pendulum.scheduling.names}
+    with pytest.raises(SpecError, match=f"{pendulum.scheduling.names[0]} is NaN") as refused:
+        pendulum.scheduling.weights(point)
+    assert refused.value.path == f"scheduling.{pendulum.scheduling.names[0]}"

@@ -194,8 +194,14 @@ class Scheduling:
         return np.minimum(np.maximum(values, self.low), self.high)
 
     def weights(self, point: Mapping[str, float] | Sequence[float] | FloatArray) -> FloatArray:
-        """Return the weights ``(N,)`` of the vertices at parameters, which are moved into their ranges first."""
+        """Return the weights ``(N,)`` of the vertices at parameters, which are moved into their ranges first.
+
+        Raises `SpecError` for a parameter that is missing, unknown or NaN.
+        """
         values = self.nearest(self.values(point))
+        if np.isnan(values).any():
+            missing = self.names[int(np.argmax(np.isnan(values)))]
+            raise SpecError(f"{missing} is NaN: there are no weights without its value.", path=f"scheduling.{missing}")
         if self.gives_weights:
             total = float(values.sum())
             return values / total if total > 0.0 else np.full(len(values), 1.0 / len(values))
