@@ -36,7 +36,7 @@ def _wild(plant: PolytopicSystem, samples: int, seed: int = 0) -> tuple[FloatArr
 
 def test_one_vertex_is_the_filter_of_the_paper() -> None:
     point = wang().center.replace(A=WANG_A)
-    one = obsynth.fault_estimation_filter(PolytopicSystem([point]), gamma_margin=0.01)
+    one = obsynth.fault_estimation_filter(PolytopicSystem([point]), gamma_margin=0.01, weight="paper")
     assert one.certificate.claims["gamma_min"] == pytest.approx(WANG_LEAST, rel=1e-6)
     paper = obsynth.fault_estimation_filter(point, weight="paper", gamma_margin=0.01)
     assert one.certificate.claims["gamma"] == pytest.approx(paper.certificate.claims["gamma"], rel=1e-6)
@@ -104,11 +104,13 @@ def test_errors_decay_as_is_proved(design: ObserverDesign) -> None:
 
 
 def test_a_rate_buys_a_smaller_gain() -> None:
-    slow = obsynth.fault_estimation_filter(wang(0.1, rate=0.02), gamma_margin=0.01)
+    slow = obsynth.fault_estimation_filter(wang(0.1, rate=0.02), gamma_margin=0.01, weight="paper")
     assert "G_region" in slow.certificate.matrices
     assert "at most 0.02 in a second" in slow.report["LMI"].claim
     any_course = obsynth.fault_estimation_filter(
-        PolytopicSystem(list(slow.scheduled[0].vertices), scheduling={"a": [-1.0, 1.0]}), gamma_margin=0.01
+        PolytopicSystem(list(slow.scheduled[0].vertices), scheduling={"a": [-1.0, 1.0]}),
+        gamma_margin=0.01,
+        weight="paper",
     )
     assert slow.certificate.claims["gamma_min"] <= any_course.certificate.claims["gamma_min"] * (1 + 1e-6)
     # With a faster parameter the certificate is none.
@@ -230,6 +232,9 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, design: ObserverDesign) 
 def test_what_a_filter_over_a_region_does_not_have_is_refused_by_name() -> None:
     with pytest.raises(SpecError, match="has no mean"):
         obsynth.fault_estimation_filter(wang(), mean=3)
+    with pytest.raises(SpecError, match="has no given weight") as refused:
+        obsynth.fault_estimation_filter(wang(), weight=np.eye(2, 3))
+    assert refused.value.path == "method.options.weight"
     with pytest.raises(SpecError, match="has no engine"):
         obsynth.fault_estimation_filter(wang(), engine="riccati")
     for method in ("pd_observer", "functional_filter"):
@@ -296,3 +301,41 @@ def test_disturbances_that_can_be_decoupled_leave_a_negligible_gain() -> None:
     design = obsynth.fault_estimation_filter(plant)
     assert design.report.passed
     assert design.certificate.claims["gamma"] < 1e-3
+
+
+def _random_region(seed: int, *, outputs: int = 2) -> PolytopicSystem:
+    """Return a plant of three states whose disturbance cannot be decoupled, with noise in its outputs."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3, 3))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    turn = 0.1 * rng.standard_normal((3, 3))
+    shared: dict[str, FloatArray] = {
+        "C": rng.standard_normal((outputs, 3)),
+        "Bf": rng.standard_normal((3, 1)),
+        "Bd": np.hstack([rng.standard_normal((3, 1)), np.zeros((3, outputs))]),
+        "Dd": np.hstack([np.zeros((outputs, 1)), 0.3 * np.eye(outputs)]),
+    }
+    return PolytopicSystem([obsynth.DescriptorSystem(np.eye(3), A + v * turn, **shared, dt=1.0) for v in (-1.0, 1.0)])
+
+
+def test_the_free_weight_is_that_of_the_constant_filter_at_one_vertex() -> None:
+    plant = _random_region(1)
+    one = obsynth.fault_estimation_filter(PolytopicSystem([plant.center]), gamma_margin=0.01)
+    constant = obsynth.fault_estimation_filter(plant.center, weight="free", gamma_margin=0.01, engine="lmi")
+    assert one.certificate.claims["gamma_min"] == pytest.approx(constant.certificate.claims["gamma_min"], rel=1e-3)
+    paper = obsynth.fault_estimation_filter(PolytopicSystem([plant.center]), gamma_margin=0.01, weight="paper")
+    assert paper.certificate.claims["gamma_min"] > 1.01 * one.certificate.claims["gamma_min"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_least_gain_depends_on_no_coordinates(seed: int) -> None:
+    """With the weight of the paper it moved by half with the units of outputs; noise in outputs failed altogether."""
+    rng, plant = np.random.default_rng(seed), _random_region(seed)
+    T, S = rng.standard_normal((3, 3)), np.diag(10.0 ** rng.uniform(-2, 2, 2))
+    moved = [
+        v.replace(A=T @ v.A @ np.linalg.inv(T), C=S @ v.C @ np.linalg.inv(T), Bf=T @ v.Bf, Bd=T @ v.Bd, Dd=S @ v.Dd)
+        for v in plant.vertices[::-1]
+    ]
+    least = obsynth.fault_estimation_filter(plant).certificate.claims["gamma_min"]
+    other = obsynth.fault_estimation_filter(PolytopicSystem(moved)).certificate.claims["gamma_min"]
+    assert other == pytest.approx(least, rel=1e-3)

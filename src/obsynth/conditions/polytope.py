@@ -63,6 +63,7 @@ def vertex_inequalities(
     gain: str = "scheduled",
     gains: Sequence[FloatArray] | None = None,
     gain_limit: float | None = None,
+    free_output: bool = False,
     margin: float = MARGIN,
 ) -> Conditions:
     """Return the inequalities at the vertices of an error system, in P and Y.
@@ -88,6 +89,9 @@ def vertex_inequalities(
         Given gains, which are analysed.
     gain_limit : float, optional
         Largest Frobenius norm of each Y.
+    free_output : bool, optional
+        Whether z may have ``V (C e + D w)`` besides, V a variable, which the innovation gives an estimate at no cost;
+        in discrete time, for the gain, with C and D constant.
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
@@ -95,7 +99,7 @@ def vertex_inequalities(
     -------
     Conditions
         Variables ``P`` (or ``P[1]``, ...), ``G``, ``Y[1]``, ... and ``gamma_squared`` or ``mean_square``, or ``room``
-        where the level is given; gains ``L[1]``, ..., and ``P[1]``, ``G[1]``, ... that `witness_of` reads.
+        where the level is given, and ``V``; gains ``L[1]``, ..., and ``P[1]``, ``G[1]``, ... that `witness_of` reads.
 
     Raises
     ------
@@ -114,7 +118,12 @@ def vertex_inequalities(
     chosen(lyapunov, "lyapunov", ("common", "vertex"))
     chosen(gain, "gain", ("scheduled", "constant"))
     _require_fitting(errors, goal, level, decay, lyapunov, steps, gain, gains)
-    forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains)
+    if free_output and (goal != "gain" or errors.dt <= 0.0 or not errors.constant_output):
+        raise SpecError(
+            "A free part of z is for the gain in discrete time, with C and D constant: leave free_output out.",
+            path="free_output",
+        )
+    forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains, free_output=free_output)
     room = cp.Variable(name="room") if level is not None or goal == "decay" else None
     slack = margin if room is None else room
     variables = forms.variables()
@@ -211,9 +220,12 @@ class _Forms:
     pairs: list[Pair] | None
     fixed_gains: Sequence[FloatArray] | None
     t: Any
+    V: Any  # of the innovation in z, or none
 
     @classmethod
-    def of(cls, errors: ErrorPolytope, *, lyapunov: str, steps: float | None, gain: str, gains: Any) -> _Forms:
+    def of(
+        cls, errors: ErrorPolytope, *, lyapunov: str, steps: float | None, gain: str, gains: Any, free_output: bool
+    ) -> _Forms:
         """Return new variables."""
         n, m, count, k = errors.order, errors.outputs, errors.count, errors.differential
         by_vertex, moving = lyapunov == "vertex", lyapunov == "vertex" or steps is not None
@@ -239,14 +251,15 @@ class _Forms:
 
             Y = [unknown("Y")] * count if gain == "constant" else [unknown(f"Y[{i + 1}]") for i in range(count)]
         pairs = pairs_of(count, steps) if moving else None
-        return cls(errors, Ps, Gs, Y, moving or bool(below), pairs, gains, t)
+        V = cp.Variable((len(errors.Cz[0]), m), name="V") if free_output else None
+        return cls(errors, Ps, Gs, Y, moving or bool(below), pairs, gains, t, V)
 
     def variables(self) -> dict[str, Any]:
         """Return the variables by name."""
         variables: dict[str, Any] = {}
         for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.fixed_gains is None else ())):
             variables |= {part.name(): part for part in matrix.variables()}
-        return variables | ({"t": self.t} if self.t is not None else {})
+        return variables | {name: part for name, part in (("t", self.t), ("V", self.V)) if part is not None}
 
     def unknown_gains(self) -> list[tuple[str, Any]]:
         """Return the gains that are sought, with the ends of their names."""
@@ -276,6 +289,8 @@ class _Forms:
         GA = _mean([g.T @ a - y @ c for g, a, y, c in zip(self.G, errors.A, self.Y, errors.C, strict=True)], now)
         GB = _mean([g.T @ b - y @ d for g, b, y, d in zip(self.G, errors.B, self.Y, errors.D, strict=True)], now)
         Z, Dz = _mean(list(errors.Cz), now), _mean(list(errors.Dz), now)
+        if self.V is not None:
+            Z, Dz = Z + self.V @ errors.C[0], Dz + self.V @ errors.D[0]
         if errors.dt > 0.0:
             low = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
             return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, slack)

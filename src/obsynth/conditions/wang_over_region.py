@@ -74,5 +74,5 @@ def errors_over_region(parts: FilterOverRegion, W: FloatArray) -> tuple[ErrorPol
         L0.append(first)
         A1.append(TA - first @ C)
         B1.append(T @ vertex.Bd - TA @ (N @ Dd) - first @ output_part)
-    errors = ErrorPolytope(A1, U2.T @ C, B=B1, D=U2.T @ output_part, Cz=W @ C, Dz=-W @ output_part, dt=parts.work[0].dt)
+    errors = ErrorPolytope(A1, U2.T @ C, B=B1, D=U2.T @ output_part, Cz=W @ C, Dz=W @ output_part, dt=parts.work[0].dt)
     return errors, L0, U2

@@ -11,7 +11,7 @@ product :math:`L(\mu) C(\mu)` would be of second degree.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -120,6 +120,20 @@ class ErrorPolytope:
         """Whether C and D are the same at all vertices."""
         return all(
             np.array_equal(c, self.C[0]) and np.array_equal(d, self.D[0]) for c, d in zip(self.C, self.D, strict=True)
+        )
+
+    def with_innovation(self, V: FloatArray) -> ErrorPolytope:
+        """Return the error system with ``V (C e + D w)`` in z besides.
+
+        Parameters
+        ----------
+        V : FloatArray
+            ``(q, m)``.
+        """
+        return replace(
+            self,
+            Cz=[z + V @ c for z, c in zip(self.Cz, self.C, strict=True)],
+            Dz=[z + V @ d for z, d in zip(self.Dz, self.D, strict=True)],
         )
 
     def closed(self, gains: Sequence[FloatArray]) -> list[Vertex]:

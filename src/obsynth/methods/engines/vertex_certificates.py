@@ -25,6 +25,8 @@ from obsynth.verification.error_polytope import ErrorPolytope
 
 #: How far above the least level a proof is sought, in turn; 200 of 200 random certificates passed at the first.
 ROOMS = (5e-4, 2e-3, 1e-2, 5e-2)
+#: And where none of these is proved: a claim that is some times the least one is better than none.
+WIDE_ROOMS = (0.2, 1.0, 4.0, 20.0, 100.0)
 #: By how much faster a decay is sought than it is proved.
 DECAY_ROOM = 1e-3
 #: A level in other units than these is solved again in units of its own.
@@ -33,7 +35,7 @@ LEVEL_UNITS = (2.0**-4, 2.0**4)
 MOST_RESCALINGS = 4
 #: Shares of what errors are about that count as no gain at all: where errors can be decoupled, the least level is zero
 #: but for rounding, and the first of these that is proved is shipped.
-NEGLIGIBLE = (1e-4, 1e-3, 1e-2)
+NEGLIGIBLE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 #: Steps by which a decay that is not proved is made slower, towards none.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
 #: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
@@ -63,6 +65,8 @@ class VertexCertificate:
         Of the level.
     runs : tuple of mapping
         Records of the solver.
+    output : FloatArray, optional
+        V of the innovation in z, where it was free.
     """
 
     gains: list[FloatArray]
@@ -72,6 +76,7 @@ class VertexCertificate:
     decay: float
     proof: VertexProof
     runs: tuple[Mapping[str, Any], ...]
+    output: FloatArray | None = None
 
     def gain_times(self, reach: float) -> float:
         """Return the level times a bound ``reach``, which no rounding of the product and its quotient brings below."""
@@ -89,6 +94,7 @@ def certified(
     steps: float | None = None,
     gain: str = "scheduled",
     gains: Sequence[FloatArray] | None = None,
+    free_output: bool = False,
     solver: str = "CLARABEL",
     settings: Mapping[str, Any] | None = None,
 ) -> VertexCertificate:
@@ -104,7 +110,7 @@ def certified(
         A level that is required; by default ``1 + margin`` times the least one.
     margin : float, optional
         Relative distance to the least level.
-    decay, lyapunov, steps, gain, gains : optional
+    decay, lyapunov, steps, gain, gains, free_output : optional
         As for `obsynth.conditions.vertex_inequalities`.
     solver : str, optional
         Any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
@@ -119,12 +125,13 @@ def certified(
     # A little more decay than asked for: what a solver leaves of its constraints is off by its tolerances.
     target_decay = None if decay is None else decay * (1.0 - DECAY_ROOM if errors.dt > 0.0 else 1.0 + DECAY_ROOM)
     options: dict[str, Any] = {"goal": goal, "decay": target_decay, "lyapunov": lyapunov, "steps": steps, "gain": gain}
+    options |= {"free_output": True} if free_output else {}
     units = ErrorUnits.of(errors)
     runs: list[dict[str, Any]] = []
     prover = prove_gain if goal == "gain" else prove_mean_square
     more = {"ball": errors.ball} if goal == "gain" else {}
     least, z_unit, size = _least(units, options, gains, solver, settings, runs)
-    levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
+    levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS + WIDE_ROOMS]
     if level is None and least < NEGLIGIBLE[0] * size:
         levels = [share * size for share in NEGLIGIBLE]
     for target in dict.fromkeys(levels):
@@ -139,12 +146,14 @@ def certified(
             # The solver's own only where a decay needs more than the best one for the gain.
             candidates = [[_best_gain(moved, inner.P[0], target / z_unit)], own]
         witness = units.witness_out(inner, z_unit)
+        V = problem.variables["V"].value * z_unit / units.outputs if free_output else None
+        whole = errors if V is None else errors.with_innovation(V)
         for each in candidates:
             made = [units.gain_out(L) for L in each] if gains is None else [np.asarray(L, np.float64) for L in gains]
-            proof = prover(errors.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
+            proof = prover(whole.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
             rate = proved_decay(errors, made, witness, required=decay) if proof.proved else None
             if rate is not None and (decay is None or (rate <= decay if errors.dt > 0.0 else rate >= decay)):
-                return VertexCertificate(made, witness, target, least, rate, proof, tuple(runs))
+                return VertexCertificate(made, witness, target, least, rate, proof, tuple(runs), V)
     if level is not None and level < least:
         raise SolverError(
             f"No observer with one certificate over the region was found at {level:.6g}: the least level found for "

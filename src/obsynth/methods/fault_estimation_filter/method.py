@@ -64,7 +64,7 @@ class FaultEstimationFilter(Method):
         Upsilon = I``, of little noise for the gamma that is shipped; or a matrix ``(nf, ny)`` with ``W Upsilon = I``,
         in units of faults by outputs (``gains["Upsilon"]`` of any design with the same T).  By default the free one,
         unless no noise is stated and it lowers the least gamma by less than 5 %; a note gives both.  With S or
-        bisection the paper's.
+        bisection the paper's.  Over a region the free one by default, constant, and no matrix.
     residual_weight_limit : float, optional
         Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional

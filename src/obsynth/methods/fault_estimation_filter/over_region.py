@@ -1,6 +1,7 @@
 """The fault-estimation filter over the region of a polytopic plant: gains at the vertices, one certificate for all.
 
 Wang 2015, (45), with the vertices of A1 and T D: P and Y of `obsynth.conditions.polytope`, L of (60) at each vertex.
+``W = Upsilon^+ + V U2'`` with V a variable beside P and Y, so that neither states nor outputs have units that matter.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from obsynth.analysis.existence.over_region import FilterOverRegion, examine_ove
 from obsynth.analysis.existence.turning_filter import TurningFilter
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
@@ -34,7 +35,6 @@ from obsynth.verification.over_region import rows_to_forget, stored_witness
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
     "S", "constraints", "mean", "objective", "prove_least", "region", "residual_weight_limit",
-    "weight",
 )  # fmt: skip
 
 
@@ -80,7 +80,9 @@ def _synthesis(
     steps: float | None,
 ) -> Synthesis:
     errors, L0, U2 = errors_over_region(parts, W)
-    gains: dict[str, FloatArray] = {"T": parts.T, "N": parts.N, "W": W, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
+    # L0 is that of the pseudoinverse: another W changes R alone.
+    own = W if certificate.output is None else W + certificate.output @ U2.T
+    gains: dict[str, FloatArray] = {"T": parts.T, "N": parts.N, "W": own, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
     R = certificate.gains * (errors.count if len(certificate.gains) == 1 else 1)
     L = [first + r @ U2.T for first, r in zip(L0, R, strict=True)]
     gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
@@ -107,11 +109,12 @@ def _require_options(method: FaultEstimationFilter) -> None:
     unsupported = [name for name in NOT_OVER_REGION if getattr(method, name) is not getattr(plain, name)]
     unsupported += ["gamma_search"] if method.gamma_search != plain.gamma_search else []
     unsupported += ["engine"] if method.engine == "riccati" else []
+    unsupported += ["given weight"] if method.given_weight is not None else []
     if unsupported:
         raise SpecError(
             f"A filter over a region has no {', '.join(unsupported)}: leave it out. It takes gamma, gamma_margin, "
-            "decay, solver and solver_options.",
-            path=f"method.options.{unsupported[0]}",
+            "decay, weight ('free' or 'paper'), solver and solver_options.",
+            path=f"method.options.{unsupported[0].removeprefix('given ')}",
         )
     chosen_solver(method.solver, method.solver_options)
 
@@ -135,17 +138,23 @@ def _certified(
         )
     lyapunov = "common" if steps is None else "vertex"
     level = method.gamma / parts.reach if method.gamma is not None and count else None
-    return certified(
-        work,
-        level=level,
-        margin=method.gamma_margin if margin is None else margin,
-        decay=None if method.decay is None else float(np.exp(-method.decay * errors.dt)),
-        lyapunov=lyapunov,
-        steps=steps,
-        gains=gains,
-        solver=method.solver,
-        settings=method.solver_options,
-    )
+    options: dict[str, Any] = {
+        "level": level,
+        "margin": method.gamma_margin if margin is None else margin,
+        "decay": None if method.decay is None else float(np.exp(-method.decay * errors.dt)),
+        "lyapunov": lyapunov,
+        "steps": steps,
+        "gains": gains,
+        "solver": method.solver,
+        "settings": method.solver_options,
+    }
+    if count and gains is None and method.asks_for_free_weight is not False and errors.outputs:
+        try:
+            return certified(work, free_output=True, **options)
+        except SolverError:
+            if method.asks_for_free_weight:
+                raise
+    return certified(work, **options)
 
 
 def _realised(
