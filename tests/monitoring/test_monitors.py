@@ -166,7 +166,7 @@ def test_bounds_hold_for_bounded_noise_whatever_it_is(kind: str, noisy) -> None:
     watched = obsynth.monitor(design, scenario, kind, noise_bound=2.0, window=7 if kind == "window" else None)
     bench, rng = make_bench(design, scenario), np.random.default_rng(0)
     steps, runs = bench.signals.steps, 400
-    signals = np.zeros((steps, runs, bench.signals.left.shape[1]))
+    signals = np.zeros((steps, runs, bench.signals.at_begin.shape[1]))
     # The extremes of the bounds, at random and in steady patterns.
     signs = rng.choice([-1.0, 1.0], (steps, runs, 1))
     signs[:, ::2] = np.sign(np.sin(rng.uniform(0, np.pi, (1, runs // 2, 1)) * np.arange(steps)[:, None, None] + 0.1))

@@ -35,7 +35,7 @@ def test_hidden_states_are_taken_out_and_the_rest_is_kept(seed: int) -> None:
     assert found.order == seen
     np.testing.assert_allclose(np.sort_complex(finite_values(found)), expected, rtol=1e-10)
     for own, whole in ((np.vstack([found.A, found.C]), pencil_a), (np.vstack([found.E, 0 * found.C]), pencil_e)):
-        np.testing.assert_allclose(found.left @ whole, own @ found.right, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.left_factor @ whole, own @ found.right_factor, rtol=0, atol=1e-12)
 
 
 def test_a_group_of_inputs_leaks_as_much_as_by_itself() -> None:

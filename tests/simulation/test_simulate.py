@@ -45,8 +45,8 @@ def moved(plant: obsynth.DescriptorSystem, scenario: obsynth.Scenario):
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     stepper = make_stepper(plant, drive, initial_state=start, stabilise=scenario.stabilise)
     drawn, noise, _ = drive.drawn([scenario.seed], stepper.noisy.shape[1])
-    left = drive.left[:, None] + drawn
-    states, outputs, _ = stepper.run(left, (drive.right - drive.left)[:, None] + 0.0 * left, noise)
+    left = drive.at_begin[:, None] + drawn
+    states, outputs, _ = stepper.run(left, (drive.at_end - drive.at_begin)[:, None] + 0.0 * left, noise)
     return states[:, 0], outputs[:, 0], left[:, 0]
 
 

@@ -63,7 +63,7 @@ def test_a_continuous_plant_agrees_with_an_integrator() -> None:
     drive = resolve(plant, scenario)
     parameters = scheduled_parameters(plant, scenario, drive.steps, drive.dt)
     states, _ = region_runs(
-        plant, parameters, drive.left[:, None], drive.right[:, None], np.zeros((drive.steps, 1, 0)),
+        plant, parameters, drive.at_begin[:, None], drive.at_end[:, None], np.zeros((drive.steps, 1, 0)),
         np.array([1.0, 0, 0]), drive.dt,
     )  # fmt: skip
 

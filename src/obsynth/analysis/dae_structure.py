@@ -223,8 +223,8 @@ def _sensitivities(
         F, G, _ = step.sensitivities(solution, x, inputs[k], theta)
         x = solution.x
         if k == 1:
-            left, values, _ = np.linalg.svd(F * scales / scales[:, None])
-            free = left[:, values > IDENTIFIABLE_SHARE * values[0]]
+            left_vectors, values, _ = np.linalg.svd(F * scales / scales[:, None])
+            free = left_vectors[:, values > IDENTIFIABLE_SHARE * values[0]]
             moved = np.hstack([scales[:, None] * free, np.zeros((model.nx, model.nq))])
         else:
             moved = F @ moved
@@ -276,8 +276,8 @@ def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tupl
     if not np.isfinite(matrix).all():
         bad = [i % model.nx for i, row in enumerate(matrix) if not np.isfinite(row).all()]
         return tuple(model.equation_names[i] for i in sorted(set(bad))), ()
-    left, _, right = np.linalg.svd(matrix)
-    return _named(left[:, -1], model.equation_names), _named(right[-1], model.state_names)
+    left_vectors, _, right_vectors = np.linalg.svd(matrix)
+    return _named(left_vectors[:, -1], model.equation_names), _named(right_vectors[-1], model.state_names)
 
 
 def _named(vector: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -45,9 +45,9 @@ class Parser(argparse.ArgumentParser):
             known = list(self._option_string_actions)
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]
             close = [(word, meant(word, known)) for word in wrong if word not in known]
-            questions = "".join(f" There is no option {word}.{question}" for word, question in close if question)
-            questions += self._meant_file(message)
-            message += f".{questions}" if questions else ""
+            suggestions = "".join(f" There is no option {word}.{suggested}" for word, suggested in close if suggested)
+            suggestions += self._meant_file(message)
+            message += f".{suggestions}" if suggestions else ""
         super().error(message)
 
     def _meant_file(self, message: str) -> str:

@@ -41,18 +41,18 @@ def direct_part(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatA
     """Return the outputs without direct disturbance, ``Bd Dd^+``, and a basis of the disturbances left."""
     if not plant.Dd.any():
         return np.eye(plant.ny), np.zeros((plant.nx, plant.ny)), _range_basis(plant.Bd)
-    left, values, right = np.linalg.svd(plant.Dd)
+    left_vectors, values, right_vectors = np.linalg.svd(plant.Dd)
     rank = numerical_rank(values)
-    inverse = right[:rank].T @ (left[:, :rank] / values[:rank]).T
-    return left[:, rank:].T, plant.Bd @ inverse, _range_basis(plant.Bd @ right[rank:].T)
+    inverse = right_vectors[:rank].T @ (left_vectors[:, :rank] / values[:rank]).T
+    return left_vectors[:, rank:].T, plant.Bd @ inverse, _range_basis(plant.Bd @ right_vectors[rank:].T)
 
 
 def _range_basis(matrix: FloatArray) -> FloatArray:
     if matrix.shape[1] == 0 or not matrix.any():
         return np.zeros((matrix.shape[0], 0))
     lengths = np.linalg.norm(matrix, axis=0)
-    left, values, _ = np.linalg.svd(matrix / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-    return np.asarray(left[:, : numerical_rank(values)])
+    left_vectors, values, _ = np.linalg.svd(matrix / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+    return np.asarray(left_vectors[:, : numerical_rank(values)])
 
 
 def decouple(plant: DescriptorSystem) -> Decoupled:
@@ -97,14 +97,14 @@ def _rank_completion(
     rows, columns = ut.shape
     if columns == 0 or nu.shape[0] == 0:
         return np.zeros((rows, nu.shape[0]))
-    left, values, right = np.linalg.svd(ut)
+    left_vectors, values, right_vectors = np.linalg.svd(ut)
     rank = numerical_rank(values, scale=size)
     largest = float(values[0]) if rank else 1.0
     lacking = columns - rank
     if lacking == 0:
         return np.zeros((rows, nu.shape[0]))
-    kernel = right[rank:].T
-    free = left[:, rank:]
+    kernel = right_vectors[rank:].T
+    free = left_vectors[:, rank:]
     scale = float(np.linalg.norm(target))
     outside = free @ _nearest_isometry(free.T @ target @ kernel, free.T @ generic @ kernel, scale)
     image = nu @ kernel
@@ -114,11 +114,11 @@ def _rank_completion(
 def _nearest_isometry(matrix: FloatArray, otherwise: FloatArray, scale: float) -> FloatArray:
     """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor.
     Directions in which the matrix is nothing beside ``scale`` go where ``otherwise (m, n)`` sends them."""
-    left, values, right = np.linalg.svd(matrix)
+    left_vectors, values, right_vectors = np.linalg.svd(matrix)
     rank = numerical_rank(values, scale=scale)
-    isometry = left[:, :rank] @ right[:rank]
+    isometry = left_vectors[:, :rank] @ right_vectors[:rank]
     if rank < matrix.shape[1]:
-        outer, inner = left[:, rank:], right[rank:]
+        outer, inner = left_vectors[:, rank:], right_vectors[rank:]
         turned = np.linalg.svd(outer.T @ otherwise @ inner.T, full_matrices=False)
         isometry = isometry + outer @ turned[0] @ turned[2] @ inner
     return np.asarray(isometry)

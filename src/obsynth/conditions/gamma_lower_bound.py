@@ -73,8 +73,8 @@ def null_space(matrix: FloatArray) -> FloatArray:
 
 def _range(matrix: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the range."""
-    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left[:, : _rank(values)])
+    left_vectors, values, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left_vectors[:, : _rank(values)])
 
 
 def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -123,9 +123,9 @@ def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
     for _ in range(n + 1):
         unseen = null_space(np.hstack([top, -reached]))[:size]
         point = point + 0.5 * unseen @ unseen.T
-        left, values, _ = np.linalg.svd(image @ unseen * np.sqrt(0.5), full_matrices=False)
+        left_vectors, values, _ = np.linalg.svd(image @ unseen * np.sqrt(0.5), full_matrices=False)
         rank = _rank(values)
-        reached = left[:, :rank] * values[:rank]
+        reached = left_vectors[:, :rank] * values[:rank]
     point, reached = 0.5 * (point + point.T), _range(reached)
     outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
     if outside.shape[1] == 0:

@@ -173,9 +173,6 @@ def slope_inequality(
         values = {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)}
         return values | {each: np.diag(np.asarray(T.value)) for each, T in multipliers.items()}
 
-    def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
-        raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")
-
     return Conditions(
         f"one inequality with a {multiplier} multiplier",
         lmi.semidefinite_problem(objective, list(constraints.values())),
@@ -185,8 +182,12 @@ def slope_inequality(
         constraints,
         tuple,
         gains,
-        unsupported,
+        _no_design,
     )
+
+
+def _no_design(_: dict[str, FloatArray], name: str) -> ObserverDesign:
+    raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")
 
 
 def _limits(goal: str, P: Any, room: Any, Y: Any, gain_limit: float | None) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def expected_of(sampled: DescriptorSystem, scenario: Scenario | None) -> Expecte
         # A scenario that is none of this plant is refused where it is simulated.
         return None
     first = sampled.nu
-    largest = np.abs(signals.left[:, first : first + sampled.nf]).max(axis=0)
+    largest = np.abs(signals.at_begin[:, first : first + sampled.nf]).max(axis=0)
     sizes = {name: float(size) for name, size in zip(sampled.fault_names, largest, strict=True) if size > 0.0}
     factor, deviations = scenario.noise or 1.0, np.array(signals.deviations)
     plant = sampled

@@ -130,19 +130,19 @@ class ThinBack(NamedTuple):
         """Return the rows in other units of the states."""
         return ThinBack(self.rows * units, self.weight)
 
-    def passed(self, left: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return ``left M^-1``, ``left X`` and ``N = W + rows X rows'``, ``M = I + X G``; ``None`` where M is singular.
+    def passed(self, factor: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return ``factor M^-1``, ``factor X`` and ``N = W + rows X rows'``; ``None`` if ``M = I + X G`` is singular.
 
         ``M^-1 = I - X rows' N^-1 rows`` and ``G M^-1 = rows' N^-1 rows``.
         """
         image = solution.dot(self.rows.T)
         weight = self.weight + self.rows.dot(image)
         weight = 0.5 * (weight + weight.T)
-        moved = left.dot(solution)
+        moved = factor.dot(solution)
         _, _, solved, failed = lapack.dgesv(weight, moved.dot(self.rows.T).T, overwrite_b=1)
         if failed:
             return None
-        return left - solved.T.dot(self.rows), moved, weight
+        return factor - solved.T.dot(self.rows), moved, weight
 
 
 def symmetric_product(a: FloatArray, b: FloatArray) -> FloatArray:

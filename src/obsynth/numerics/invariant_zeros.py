@@ -53,9 +53,9 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
             u = (matrix @ v).conj()
             u = u / (float(np.linalg.norm(u)) or 1.0)
         else:
-            left, sizes, right = np.linalg.svd(matrix)
+            left_vectors, sizes, right_vectors = np.linalg.svd(matrix)
             largest, smallest = float(sizes[0]), float(sizes[normal_rank - 1])
-            u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
+            u, v = left_vectors[:, normal_rank - 1].conj(), right_vectors[normal_rank - 1].conj()
         if largest == 0.0:
             return True
         best = min(best, smallest / largest)

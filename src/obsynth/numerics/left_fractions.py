@@ -68,12 +68,12 @@ class FractionProblem:
 
 
 class Criterion(NamedTuple):
-    """Where the error ``left @ (response - target) @ right`` is weighed: angles, and the share of each."""
+    """Where the error ``left_weight @ (response - target) @ right_weight`` is weighed: angles and their shares."""
 
     angles: FloatArray
     shares: FloatArray
-    left: ComplexArray
-    right: ComplexArray
+    left_weight: ComplexArray
+    right_weight: ComplexArray
     target: ComplexArray
 
 
@@ -159,8 +159,8 @@ def _kernel(problem: FractionProblem, degree: int) -> FloatArray:
         powers.append(powers[-1] @ problem.A)
     states = np.vstack(powers[problem.spare :])
     states[:, : problem.own] = np.vstack(powers[: degree + 1])[:, : problem.own]
-    left, values, _ = np.linalg.svd(states, full_matrices=False)
-    states = left[:, values > WINDOW_RANK_TOLERANCE * max(float(np.max(values, initial=0.0)), SMALLEST)]
+    left_vectors, values, _ = np.linalg.svd(states, full_matrices=False)
+    states = left_vectors[:, values > WINDOW_RANK_TOLERANCE * max(float(np.max(values, initial=0.0)), SMALLEST)]
     hidden = stacked(problem.A, problem.C, problem.Bh, problem.Dh, length)[problem.spare * height :]
     hidden = hidden / max(float(np.linalg.norm(hidden)), SMALLEST)
     conditions = [states, hidden]
@@ -194,10 +194,10 @@ def _rows(problem: FractionProblem, degrees: Sequence[int]) -> list[_Row] | None
     for degree in degrees:
         basis = _kernel(problem, degree)
         newest = basis[-problem.rows :]
-        left, values, _ = np.linalg.svd(newest - taken @ (taken.T @ newest), full_matrices=False)
+        left_vectors, values, _ = np.linalg.svd(newest - taken @ (taken.T @ newest), full_matrices=False)
         if not len(values) or values[0] <= INDEPENDENT_SHARE:
             return None
-        direction = left[:, 0]
+        direction = left_vectors[:, 0]
         share = direction @ newest
         first = basis @ (share / (share @ share))
         free = basis @ scipy.linalg.null_space(share[None, :])
@@ -360,7 +360,7 @@ def _errors(
     inverse = np.linalg.inv(_denominators(problem, rows, t, points))
     response = inverse @ driven
     # The rows' sum is zero, not the error: what is estimated is minus that of y, from which the target is taken.
-    errors = criterion.left @ (-response - criterion.target) @ criterion.right
+    errors = criterion.left_weight @ (-response - criterion.target) @ criterion.right_weight
     return np.asarray(errors), np.asarray(inverse), np.asarray(response)
 
 
@@ -379,8 +379,8 @@ def _logarithm(
     total = max(float(np.sum(criterion.shares[:, None] * squares**exponent)), SMALLEST)
     slopes = criterion.shares[:, None] * squares ** (exponent - 1) / (total * largest)
     of_errors = (vectors * slopes[:, None, :]) @ np.conj(np.swapaxes(vectors, 1, 2)) @ errors
-    turned = np.conj(np.swapaxes(criterion.left @ inverse, 1, 2))
-    of_driven = -turned @ of_errors @ np.conj(np.swapaxes(criterion.right, 1, 2))
+    turned = np.conj(np.swapaxes(criterion.left_weight @ inverse, 1, 2))
+    of_driven = -turned @ of_errors @ np.conj(np.swapaxes(criterion.right_weight, 1, 2))
     of_denominator = -of_driven @ np.conj(np.swapaxes(response, 1, 2))
     points = np.exp(1j * criterion.angles)
     return (

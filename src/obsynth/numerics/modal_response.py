@@ -216,10 +216,10 @@ def level_crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     weight = np.eye(d.shape[1]) - d.T @ d
     solved = np.linalg.solve(weight, np.hstack([d.T @ c, b.T]))
     through, back = solved[:, :n], solved[:, n:]
-    left, right = np.eye(2 * n), np.eye(2 * n)
-    left[n:, :n], left[n:, n:] = c.T @ c + c.T @ d @ through, a.T + c.T @ d @ back
-    right[:n, :n], right[:n, n:] = a + b @ through, b @ back
-    alpha, beta = _pencil_eigenvalues(right, left)
+    leading, constant = np.eye(2 * n), np.eye(2 * n)
+    leading[n:, :n], leading[n:, n:] = c.T @ c + c.T @ d @ through, a.T + c.T @ d @ back
+    constant[:n, :n], constant[:n, n:] = a + b @ through, b @ back
+    alpha, beta = _pencil_eigenvalues(constant, leading)
     size = np.abs(alpha) + np.abs(beta)
     # |alpha| and |beta| are compared, not divided: infinite eigenvalues need no special case.
     miss = np.abs(np.abs(alpha) - np.abs(beta)) / np.where(size == 0.0, 1.0, 0.5 * size)
@@ -228,19 +228,19 @@ def level_crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     return np.asarray(np.abs(np.angle(alpha[near] * np.conj(beta[near]))))
 
 
-def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return alpha and beta of the eigenvalues ``z = alpha / beta`` of ``right - z left``.
+def _pencil_eigenvalues(constant: FloatArray, leading: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return alpha and beta of the eigenvalues ``z = alpha / beta`` of ``constant - z leading``.
 
-    With ``z = (1 + s) / (1 - s)`` ordinary ones, of ``(right + left)^-1 (right - left)``, where none is close to -1; or
-    with ``-left``, -z and +1. The circle becomes the imaginary axis.
+    With ``z = (1 + s) / (1 - s)`` ordinary ones, of ``(constant + leading)^-1 (constant - leading)``, where none is
+    close to -1; or with ``-leading``, -z and +1. The circle becomes the imaginary axis.
     """
     from obsynth.numerics.lapack import dgecon, dgetrf, dgetrs, pencil_eigenvalues
 
     for sign in (1.0, -1.0):
-        total = np.asarray_chkfinite(right + sign * left)
+        total = np.asarray_chkfinite(constant + sign * leading)
         factors, pivots, failed = dgetrf(total)
         if not failed and dgecon(factors, np.max(np.sum(np.abs(total), axis=0)))[0] > SAFE_RECIPROCAL_CONDITION:
-            s = np.linalg.eigvals(dgetrs(factors, pivots, right - sign * left)[0])
+            s = np.linalg.eigvals(dgetrs(factors, pivots, constant - sign * leading)[0])
             return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
-    alpha, size = pencil_eigenvalues(right, left)
+    alpha, size = pencil_eigenvalues(constant, leading)
     return alpha, size.astype(np.complex128)

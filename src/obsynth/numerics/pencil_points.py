@@ -120,8 +120,8 @@ class PencilPoints:
         place = point
         for _ in range(ZERO_STEPS):
             matrix = self.A - place * self.E
-            left, _, right = np.linalg.svd(matrix, full_matrices=False)
-            u, v = left[:, -1].conj(), right[-1].conj()
+            left_vectors, _, right_vectors = np.linalg.svd(matrix, full_matrices=False)
+            u, v = left_vectors[:, -1].conj(), right_vectors[-1].conj()
             slope = u @ self.E @ v
             if slope == 0.0:
                 return None

@@ -77,18 +77,18 @@ def with_nonsingular_e(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflati
 
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
     """Return the structure of a pencil ``(m, n)`` from its two passes."""
-    right, left = passes
-    regular = is_regular(shape, right)
-    next_nullities = (*right.nullities[1:], 0)
-    counts = [rank - following for rank, following in zip(right.ranks, next_nullities, strict=False)]
+    right_deflation, left_deflation = passes
+    regular = is_regular(shape, right_deflation)
+    next_nullities = (*right_deflation.nullities[1:], 0)
+    counts = [rank - following for rank, following in zip(right_deflation.ranks, next_nullities, strict=False)]
     sizes = tuple(size for size in range(len(counts), 0, -1) for _ in range(counts[size - 1]))
     return PencilStructure(
         regular=regular,
-        normal_rank=normal_rank_of(right, left),
-        index=len(right.ranks) if regular else None,
-        finite_eigenvalues=_eigenvalues(left.E, left.A),
+        normal_rank=normal_rank_of(right_deflation, left_deflation),
+        index=len(right_deflation.ranks) if regular else None,
+        finite_eigenvalues=_eigenvalues(left_deflation.E, left_deflation.A),
         infinite_block_sizes=sizes,
-        decisions=right.decisions + left.decisions,
+        decisions=right_deflation.decisions + left_deflation.decisions,
     )
 
 
@@ -96,27 +96,33 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
     """Return the points where ``rank (A - z E)``, ``(m, n)``, drops below the normal rank, with multiplicity."""
     # A tall pencil leaves the long chains to the second pass, whose findings can be checked below.
     tall = equilibrate_pencil(E, A) if E.shape[0] >= E.shape[1] else equilibrate_pencil(E.T, A.T)
-    scales, right = without_infinite_part(tall)
-    rows, columns = right.E.shape
+    scales, right_deflation = without_infinite_part(tall)
+    rows, columns = right_deflation.E.shape
     if not rows > columns > 0:
-        left = without_left_singular_part(right, scales)
-        values = _eigenvalues(left.E, left.A)
-        return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
-    basis, square = np.linalg.qr(right.E, mode="complete")
-    turned = basis.T @ right.A
+        left_deflation = without_left_singular_part(right_deflation, scales)
+        values = _eigenvalues(left_deflation.E, left_deflation.A)
+        return FiniteZeros(
+            values,
+            normal_rank_of(right_deflation, left_deflation),
+            right_deflation.decisions + left_deflation.decisions,
+        )
+    basis, square = np.linalg.qr(right_deflation.E, mode="complete")
+    turned = basis.T @ right_deflation.A
     candidates, clear = _clearly_no_zeros((square[:columns], turned[:columns], turned[columns:]), scales)
     if np.all(clear) and not to_the_end:
         # Full rank of the columns everywhere.
-        return FiniteZeros(_in_pairs(np.zeros(0, dtype=np.complex128)), sum(right.ranks) + columns, right.decisions)
-    left = without_left_singular_part(right, scales)
-    computed, rank = _eigenvalues(left.E, left.A), normal_rank_of(right, left)
-    decisions = right.decisions + left.decisions
+        return FiniteZeros(
+            _in_pairs(np.zeros(0, dtype=np.complex128)), sum(right_deflation.ranks) + columns, right_deflation.decisions
+        )
+    left_deflation = without_left_singular_part(right_deflation, scales)
+    computed, rank = _eigenvalues(left_deflation.E, left_deflation.A), normal_rank_of(right_deflation, left_deflation)
+    decisions = right_deflation.decisions + left_deflation.decisions
     if np.all(clear):
-        return FiniteZeros(_in_pairs(computed[:0]), sum(right.ranks) + columns, decisions)
-    if rank < sum(right.ranks) + columns:
+        return FiniteZeros(_in_pairs(computed[:0]), sum(right_deflation.ranks) + columns, decisions)
+    if rank < sum(right_deflation.ranks) + columns:
         # Singular everywhere: that the pencil is so at a point says nothing.
         return FiniteZeros(computed, rank, decisions)
-    points = PencilPoints(right.E, right.A, scales)
+    points = PencilPoints(right_deflation.E, right_deflation.A, scales)
     # A staircase on the verge of a rank invents zeros at which the pencil is not singular.
     upper = [points.confirmed(complex(value)) for value in computed if value.imag >= 0.0]
     confirmed = _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
@@ -124,7 +130,9 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
     if len(zeros) == len(confirmed) == len(computed):
         # What a long staircase leaves of a zero is its rounding; the same zeros are found without it.
         places = confirmed if len(confirmed) else candidates[~clear]
-        decisions = right.decisions + tuple(points.rank(complex(place)) for place in places if place.imag >= 0.0)
+        decisions = right_deflation.decisions + tuple(
+            points.rank(complex(place)) for place in places if place.imag >= 0.0
+        )
     return FiniteZeros(zeros, rank, decisions)
 
 
@@ -228,8 +236,8 @@ def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
         values = eigenvalues(A, E)
     except np.linalg.LinAlgError:
         # LAPACK's shifts may go round in circles on matrices of great symmetry: turned, the pencil has none.
-        left, right = (np.linalg.qr(np.random.default_rng(seed).normal(size=E.shape))[0] for seed in (0, 1))
-        values = eigenvalues(left @ A @ right, left @ E @ right)
+        left_basis, right_basis = (np.linalg.qr(np.random.default_rng(seed).normal(size=E.shape))[0] for seed in (0, 1))
+        values = eigenvalues(left_basis @ A @ right_basis, left_basis @ E @ right_basis)
     return _in_pairs(np.asarray(values, dtype=np.complex128))
 
 

@@ -82,20 +82,20 @@ class SparseFactor:
         sizes of the null vectors of the rows and columns, for naming."""
         if not self.size:
             return 1.0, np.zeros(0), np.zeros(0)
-        right = np.random.default_rng(1).normal(size=self.size)
-        left, smallest = right, np.inf
+        right_vector = np.random.default_rng(1).normal(size=self.size)
+        left_vector, smallest = right_vector, np.inf
         norm = _norm_estimate(self.matrix)
         for _ in range(SMALLEST_VALUE_STEPS):
-            left = self._lu.solve(right / np.linalg.norm(right), trans="T")
-            left = left / max(float(np.linalg.norm(left)), np.finfo(float).tiny)
-            right = self._lu.solve(left)
-            length = float(np.linalg.norm(right))
+            left_vector = self._lu.solve(right_vector / np.linalg.norm(right_vector), trans="T")
+            left_vector = left_vector / max(float(np.linalg.norm(left_vector)), np.finfo(float).tiny)
+            right_vector = self._lu.solve(left_vector)
+            length = float(np.linalg.norm(right_vector))
             smallest = 0.0 if not np.isfinite(length) or length == 0.0 else 1.0 / length
             if not np.isfinite(length):
                 break
-        right = right / max(float(np.linalg.norm(right)), np.finfo(float).tiny)
+        right_vector = right_vector / max(float(np.linalg.norm(right_vector)), np.finfo(float).tiny)
         value = 0.0 if self.exactly_singular else smallest / norm
-        return value, np.abs(left), np.abs(right)
+        return value, np.abs(left_vector), np.abs(right_vector)
 
     @property
     def singular(self) -> bool:

@@ -327,8 +327,8 @@ def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
     n = len(lengths)
     if not null.shape[1]:
         return np.zeros((n, 0))
-    left, values, _ = np.linalg.svd(np.linalg.qr(null)[0][:n], full_matrices=False)
-    return np.asarray(np.linalg.qr(left[:, values > RANK_TOLERANCE] / lengths[:, None])[0])
+    left_vectors, values, _ = np.linalg.svd(np.linalg.qr(null)[0][:n], full_matrices=False)
+    return np.asarray(np.linalg.qr(left_vectors[:, values > RANK_TOLERANCE] / lengths[:, None])[0])
 
 
 def _whitened(
@@ -459,9 +459,9 @@ def _by_rank(
     solved = solved / lengths[:, None]
     # The part of the solution that is free: x and the coordinates d, in scaled units.
     free = np.linalg.qr(free)[0] if free.shape[1] else free
-    left, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
+    left_vectors, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
     undetermined = int(np.sum(values > RANK_TOLERANCE))
-    basis, weights = np.linalg.qr(left[:, :undetermined] / lengths[:n, None])
+    basis, weights = np.linalg.qr(left_vectors[:, :undetermined] / lengths[:n, None])
     into = right_vectors[:undetermined].T @ (np.linalg.inv(weights) / values[:undetermined, None])
     # What acts on x, in as few directions as it needs; the others only act on what came before.
     spread = solved[:n, columns:]
@@ -496,8 +496,8 @@ def stepped_back(later: SquareRootGaussian, back: SmootherGain) -> SquareRootGau
         factor = np.asarray(np.linalg.qr(factor.T, mode="r")).T
     diffuse = np.hstack((back.from_next @ later.diffuse, back.unknown))
     if diffuse.shape[1]:
-        left, values, _ = np.linalg.svd(diffuse, full_matrices=False)
-        diffuse = left[:, values > RANK_TOLERANCE * max(float(values[0]), 1.0)]
+        left_vectors, values, _ = np.linalg.svd(diffuse, full_matrices=False)
+        diffuse = left_vectors[:, values > RANK_TOLERANCE * max(float(values[0]), 1.0)]
     return SquareRootGaussian(mean, factor, diffuse)
 
 
@@ -576,6 +576,6 @@ def _directional(triangle: FloatArray, G: FloatArray, forgetting: float) -> Floa
         return triangle
     # In coordinates in which the present information is the identity, the directions that G excites are orthogonal.
     relative = np.linalg.solve(triangle.T, G.T)
-    left, sizes, _ = np.linalg.svd(relative, full_matrices=False)
-    excited = left[:, sizes**2 >= WORTH_FORGETTING * (1.0 - forgetting)]
+    left_vectors, sizes, _ = np.linalg.svd(relative, full_matrices=False)
+    excited = left_vectors[:, sizes**2 >= WORTH_FORGETTING * (1.0 - forgetting)]
     return np.asarray(triangle - (1.0 - np.sqrt(forgetting)) * excited @ (excited.T @ triangle))

@@ -61,10 +61,10 @@ def _deflate(
             break
         right = (full_svd(E) if first is None else first)[2]
         kernel, complement, first = right[rank:].T, right[:rank].T, None
-        left, values, _ = full_svd(A @ kernel)
+        left_vectors, values, _ = full_svd(A @ kernel)
         decision = rank_from(values, scale=scales[1], expected=columns - rank)
         decisions.append(decision)
-        left_null = left[:, decision.rank :].T
+        left_null = left_vectors[:, decision.rank :].T
         E, A = left_null @ E @ complement, left_null @ A @ complement
         nullities.append(columns - rank)
         ranks.append(decision.rank)
@@ -76,10 +76,10 @@ def full_svd(matrix: FloatArray) -> _Svd:
     """Return the full left basis, the singular values and the full right basis."""
     if matrix.size == 0:
         return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
-    left, values, right = np.linalg.svd(matrix)
-    return left, values, right
+    left_vectors, values, right_vectors = np.linalg.svd(matrix)
+    return left_vectors, values, right_vectors
 
 
-def normal_rank_of(right: Deflation, left: Deflation) -> int:
+def normal_rank_of(right_deflation: Deflation, left_deflation: Deflation) -> int:
     """Return the rank of the pencil at almost every point, from both passes."""
-    return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])
+    return sum(right_deflation.ranks) + sum(left_deflation.ranks) + int(left_deflation.E.shape[0])

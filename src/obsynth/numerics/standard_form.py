@@ -49,12 +49,12 @@ def reachable_basis(a: FloatArray, b: FloatArray, *, share: float = REACHED_SHAR
         for _ in range(2):
             x = x - basis @ (basis.T @ x)
         level = scale or (float(np.linalg.norm(b)) if not basis.shape[1] else size)
-        left, values, _ = np.linalg.svd(x, full_matrices=False)
-        left = left[:, values > share * max(level, SMALLEST)]
-        if not left.shape[1]:
+        left_vectors, values, _ = np.linalg.svd(x, full_matrices=False)
+        left_vectors = left_vectors[:, values > share * max(level, SMALLEST)]
+        if not left_vectors.shape[1]:
             break
-        basis = np.hstack([basis, left])
-        x = a @ left
+        basis = np.hstack([basis, left_vectors])
+        x = a @ left_vectors
     return basis
 
 

@@ -124,8 +124,8 @@ def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> 
         block, done = _block(iteration, count), state[4]
         if i:
             inputs = block.mx_in()
-            kept = ca.Function("kept", inputs, inputs[: len(state)])
-            block = ca.Function.if_else("further", kept, block)
+            unchanged = ca.Function("unchanged", inputs, inputs[: len(state)])
+            block = ca.Function.if_else("further", unchanged, block)
             state = list(block(done, *state, *point))
         else:
             state = list(block(*state, *point))

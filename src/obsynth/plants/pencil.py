@@ -29,8 +29,8 @@ def in_own_units(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
     """Return whether a plant's pencil ``A - z E`` is regular, and its normal rank, without eigenvalues."""
-    right, left = _reduced(plant)
-    return is_regular(plant.E.shape, right), normal_rank_of(right, left)
+    right_deflation, left_deflation = _reduced(plant)
+    return is_regular(plant.E.shape, right_deflation), normal_rank_of(right_deflation, left_deflation)
 
 
 @remembered

@@ -107,9 +107,9 @@ class AffineMatrix:
             self.center @ other.center, parts, np.where(reached, rounded_up(radius, 2 * length + 12), 0.0)
         )
 
-    def after(self, left: FloatArray) -> AffineMatrix:
-        """Return ``left`` times every member."""
-        return AffineMatrix.exact(left, self.count) @ self
+    def after(self, factor: FloatArray) -> AffineMatrix:
+        """Return ``factor`` times every member."""
+        return AffineMatrix.exact(factor, self.count) @ self
 
     def scaled(self, factor: float) -> AffineMatrix:
         """Return ``factor`` times every member."""

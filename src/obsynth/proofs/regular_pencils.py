@@ -57,8 +57,8 @@ def distance_from_circle(first: Any, second: Any) -> float:
 
 def _nearest(first: Any, second: Any, x: ComplexArray, y: ComplexArray) -> float:
     size = len(x)
-    left, right = (flint.acb_mat(size, size, part.ravel().tolist()) for part in (y, x))
-    tables = [(left * (flint.acb_mat(part) * right)).tolist() for part in (first, second)]
+    left_factor, right_factor = (flint.acb_mat(size, size, part.ravel().tolist()) for part in (y, x))
+    tables = [(left_factor * (flint.acb_mat(part) * right_factor)).tolist() for part in (first, second)]
     centres = [abs(abs(tables[0][i][i]) - abs(tables[1][i][i])).lower() for i in range(size)]
     zero = flint.arb(0)
     rows = [
@@ -113,8 +113,8 @@ def _with_subspaces(
             return np.min(apart, axis=1) <= 0.5 * distance
 
         complex_ones = [matrix.astype(complex) for matrix in matrices]
-        _, _, a, b, left, right = scipy.linalg.ordqz(*complex_ones, sort=is_member, output="complex")
+        _, _, a, b, left_vectors, right_vectors = scipy.linalg.ordqz(*complex_ones, sort=is_member, output="complex")
         if int(np.sum(is_member(a, b))) != count:
             raise np.linalg.LinAlgError("a group of eigenvalues is not apart from the others")
-        x[:, group], u[:, group] = right[:, :count], left[:, :count]
+        x[:, group], u[:, group] = right_vectors[:, :count], left_vectors[:, :count]
     return x, u

@@ -216,7 +216,7 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
     names = observer.state_names
     begin = np.array([scenario.initial_state.get(name, value) for name, value in zip(names, start, strict=True)])
     nu, estimated = len(inputs), tuple(range(len(observer.fault_names)))
-    true = inputs + drive.left[:, :nu], theta + drive.left[:, nu:]
+    true = inputs + drive.at_begin[:, :nu], theta + drive.at_begin[:, nu:]
     return Bench(
         drive,
         observer,
@@ -279,7 +279,7 @@ def _region_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
     drive = resolve_parameters(model, scenario, dt=observer.dt)
     begin = np.array([scenario.initial_state.get(name, value) for name, value in model.states.items()])
     nu = len(model.input_names)
-    inputs, parameters = model.nominal_input + drive.left[:, :nu], model.nominal_parameters + drive.left[:, nu:]
+    inputs, parameters = model.nominal_input + drive.at_begin[:, :nu], model.nominal_parameters + drive.at_begin[:, nu:]
     noise = dict(design.options.get("noise") or {}) if drive.noise else {}
     return Bench(
         drive,

@@ -192,10 +192,10 @@ def scenario_stepper(
 def scenario_runs(drive: ScenarioSignals, stepper: Stepper, parts: tuple[int, int], seeds: Sequence[int]) -> PlantRuns:
     """Run a linear plant over a scenario; ``parts``: where faults and disturbances begin among its signals."""
     drawn, noise, sensor_noise = drive.drawn(seeds, stepper.noisy.shape[1])
-    left = drive.left[:, None, :] + drawn
-    difference = np.broadcast_to((drive.right - drive.left)[:, None, :], left.shape)
-    states, clean, fed = stepper.run(left, difference, noise)
-    inputs, faults, disturbances = np.split(left, parts, axis=2)
+    at_begin = drive.at_begin[:, None, :] + drawn
+    difference = np.broadcast_to((drive.at_end - drive.at_begin)[:, None, :], at_begin.shape)
+    states, clean, fed = stepper.run(at_begin, difference, noise)
+    inputs, faults, disturbances = np.split(at_begin, parts, axis=2)
     if fed.shape[2]:
         inputs = inputs + fed
     return states, drive.measured(clean + sensor_noise), inputs, faults, disturbances

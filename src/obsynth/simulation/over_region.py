@@ -174,10 +174,10 @@ def scenario_runs_over_region(
             path="noise",
         )
     drawn, noise, sensor_noise = drive.drawn(seeds, plant.nw)
-    left, right = drive.left[:, None] + drawn, drive.right[:, None] + drawn
-    states, clean = region_runs(plant, parameters, left, right, noise, start, drive.dt)
-    u, faults, disturbances = np.split(left, (plant.nu, plant.nu + plant.nf), axis=2)
-    shared = np.broadcast_to(parameters[0][:, None], (*left.shape[:2], parameters[0].shape[1]))
+    at_begin, at_end = drive.at_begin[:, None] + drawn, drive.at_end[:, None] + drawn
+    states, clean = region_runs(plant, parameters, at_begin, at_end, noise, start, drive.dt)
+    u, faults, disturbances = np.split(at_begin, (plant.nu, plant.nu + plant.nf), axis=2)
+    shared = np.broadcast_to(parameters[0][:, None], (*at_begin.shape[:2], parameters[0].shape[1]))
     return (
         states,
         drive.measured(clean + sensor_noise),
@@ -190,29 +190,29 @@ def scenario_runs_over_region(
 def region_runs(
     plant: PolytopicSystem,
     parameters: tuple[FloatArray, FloatArray],
-    left: FloatArray,
-    right: FloatArray,
+    at_begin: FloatArray,
+    at_end: FloatArray,
     noise: FloatArray,
     start: FloatArray,
     dt: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return states and outputs ``(steps, runs, *)`` for signals ``[u, f, d]`` where intervals begin and end."""
     moving = _Moving.of(plant)
-    steps, runs = left.shape[:2]
+    steps, runs = at_begin.shape[:2]
     states, outputs = np.empty((steps, runs, plant.nx)), np.empty((steps, runs, plant.ny))
     v = np.repeat((moving.E1 @ start)[:, None], runs, axis=1)
     for k in range(steps):
         # A point that stays is not evaluated again.
         if k == 0 or not np.array_equal(parameters[0][k - 1], parameters[0][k]):
             at = moving.at(parameters[0][k])
-        s, w = left[k].T, noise[k].T
+        s, w = at_begin[k].T, noise[k].T
         x = at.state(v, s, w)
         states[k] = x.T
         outputs[k] = (at.C @ x + at.D @ s + at.Dw @ w).T
         if plant.is_discrete:
             v = moving.U1.T @ (at.A @ x + at.S @ s + at.Bw @ w)
         else:
-            v = moving.moved(v, parameters[0][k], parameters[1][k], left[k].T, right[k].T, dt)
+            v = moving.moved(v, parameters[0][k], parameters[1][k], at_begin[k].T, at_end[k].T, dt)
     finite = np.isfinite(states).reshape(steps, -1).all(axis=1)
     if not finite.all():
         raise SpecError(
@@ -283,7 +283,7 @@ class _Moving:
         return _Point(**matrices, solve=np.linalg.inv(stacked), algebraic=self.U2)
 
     def moved(
-        self, v: FloatArray, begin: FloatArray, end: FloatArray, left: FloatArray, right: FloatArray, dt: float
+        self, v: FloatArray, begin: FloatArray, end: FloatArray, at_begin: FloatArray, at_end: FloatArray, dt: float
     ) -> FloatArray:
         """Return the dynamic coordinates at the end of an interval, in continuous time."""
         parts = 1 if np.array_equal(begin, end) else PARTS
@@ -293,7 +293,7 @@ class _Moving:
             r = len(self.E1)
             a = self.U1.T @ at.A @ at.solve[:, :r]
             b = self.U1.T @ (at.S - at.A @ at.solve[:, r:] @ self.U2.T @ at.S)
-            first, last = (left + (part + edge) / parts * (right - left) for edge in (0, 1))
+            first, last = (at_begin + (part + edge) / parts * (at_end - at_begin) for edge in (0, 1))
             transition, held, ramped = first_order_hold(a, b, dt / parts)
             v = transition @ v + held @ first + ramped @ (last - first)
         return v

@@ -60,8 +60,8 @@ class Additive(Profile, ABC):
     def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
         acts, values = self.active(steps, dt), self._at(dt * np.arange(steps + 1, dtype=np.float64))
-        left = np.where(acts, values[:-1], 0.0)
-        return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
+        at_begin = np.where(acts, values[:-1], 0.0)
+        return at_begin, at_begin.copy() if self.held else np.where(acts, values[1:], 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,8 +28,8 @@ class ScenarioSignals:
     """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those."""
 
     dt: float
-    left: FloatArray  # (steps, nu + nf + nd): [u, f, d] where each interval begins
-    right: FloatArray  # where it ends
+    at_begin: FloatArray  # (steps, nu + nf + nd): [u, f, d] where each interval begins
+    at_end: FloatArray  # where it ends
     random: tuple[tuple[int, Random], ...]
     sensors: tuple[tuple[int, Profile], ...]
     noise: float
@@ -38,12 +38,12 @@ class ScenarioSignals:
     @property
     def steps(self) -> int:
         """Number of samples."""
-        return len(self.left)
+        return len(self.at_begin)
 
     def drawn(self, seeds: Sequence[int], nw: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what the seeds add: signals, plant noise, sensor noise, ``(steps, runs, *)`` each."""
         steps, ny = self.steps, len(self.deviations)
-        signals = np.zeros((steps, len(seeds), self.left.shape[1]))
+        signals = np.zeros((steps, len(seeds), self.at_begin.shape[1]))
         noise, sensors = np.zeros((steps, len(seeds), nw)), np.zeros((steps, len(seeds), ny))
         for run, seed in enumerate(seeds):
             rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ class ScenarioSignals:
 
     def first_fault(self, faults: slice) -> int | None:
         """Return the first sample at which a fault or a faulty sensor acts; `None` if there is none."""
-        wrong = np.any(self.left[:, faults] != 0.0, axis=1)
+        wrong = np.any(self.at_begin[:, faults] != 0.0, axis=1)
         for _, profile in self.sensors:
             wrong |= profile.active(self.steps, self.dt)
         return int(np.argmax(wrong)) if wrong.any() else None
@@ -137,7 +137,7 @@ def _resolved(
         )
     steps, before = int(scenario.horizon / dt + SAMPLE_SLACK) + 1, 0
     groups = {"inputs": plant.input_names, "faults": faults, "disturbances": disturbances}
-    left, right = np.zeros((2, steps, sum(map(len, groups.values()))))
+    at_begin, at_end = np.zeros((2, steps, sum(map(len, groups.values()))))
     random: list[tuple[int, Random]] = []
     for group, names in groups.items():
         for name, profile in profiles_of(scenario, group):
@@ -145,34 +145,35 @@ def _resolved(
             if isinstance(profile, Random):
                 random.append((column, profile))
             elif isinstance(profile, Additive):
-                for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
+                for ends, values in zip((at_begin, at_end), profile.sampled(steps, dt), strict=True):
                     ends[:, column] += values
             elif isinstance(plant, (DescriptorSystem, PolytopicSystem)):
                 actuator, acts = _actuator(plant, name, scenario), profile.active(steps, dt)
-                for ends in (left, right):
-                    added = _lost_command(profile, ends[:, actuator], acts, left[:, actuator])
+                for ends in (at_begin, at_end):
+                    added = _lost_command(profile, ends[:, actuator], acts, at_begin[:, actuator])
                     ends[:, column] += np.where(acts, added, 0.0)
         before += len(names)
-    _form_derivatives(plant.input_names, scenario, left, right, dt)
+    _form_derivatives(plant.input_names, scenario, at_begin, at_end, dt)
     random.sort(key=lambda item: item[0])
     uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
     if uncertain is not None and uncertain.shift and uncertain.shift not in scenario.inputs:
         # What the equilibrium's motion enters through is one, always.
-        left[:, plant.input_names.index(uncertain.shift)] = right[:, plant.input_names.index(uncertain.shift)] = 1.0
+        column = plant.input_names.index(uncertain.shift)
+        at_begin[:, column] = at_end[:, column] = 1.0
     sensors = [
         (index_of(name, plant.output_names, what="sensors"), profile)
         for name, profile in profiles_of(scenario, "sensors")
     ]
     deviations = np.array([scenario.sensor_noise.get(name, 0.0) for name in plant.output_names])
-    return ScenarioSignals(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
+    return ScenarioSignals(dt, at_begin, at_end, tuple(random), tuple(sensors), scenario.noise, deviations)
 
 
 def _form_derivatives(
-    inputs: Sequence[str], scenario: Scenario, left: FloatArray, right: FloatArray, dt: float
+    inputs: Sequence[str], scenario: Scenario, at_begin: FloatArray, at_end: FloatArray, dt: float
 ) -> None:
     """Write derivatives of known inputs for which no profile is given, by differences from sample to sample as in runs
     on logs."""
-    times = np.arange(len(left), dtype=np.float64) * float(dt)
+    times = np.arange(len(at_begin), dtype=np.float64) * float(dt)
     for column, name in enumerate(inputs):
         base = None if name in scenario.inputs else derivative_of(name, inputs)
         if base is not None:
@@ -182,8 +183,8 @@ def _form_derivatives(
                     "leave stabilise out, or take a plant without it.",
                     path="stabilise",
                 )
-            quotients, _ = difference_quotients(times, left[:, inputs.index(base[0])], base[1], None)
-            left[:, column] = right[:, column] = quotients
+            quotients, _ = difference_quotients(times, at_begin[:, inputs.index(base[0])], base[1], None)
+            at_begin[:, column] = at_end[:, column] = quotients
 
 
 def _lost_command(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:

@@ -64,12 +64,12 @@ def drawn_runs(
     seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
     random, noise, sensors = drive.drawn(seeds, sampled.nw)
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
-    faults = drive.left[:, nu : nu + nf]
+    faults = drive.at_begin[:, nu : nu + nf]
     records: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
     off = tolerance > 0.0 or source.uncertainty is not None
     for run in range(runs):
         plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
-        signals = drive.left + random[:, run]
+        signals = drive.at_begin + random[:, run]
         d = signals[:, nu + nf :] * scales[run]
         shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
         for (inputs, outputs), f in zip(records, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):

@@ -333,7 +333,7 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
     if not later.size:
         return false, float("nan"), float("nan")
     k, alarm, names = begin + int(later[0]), decision.alarm, bench.observer.fault_names
-    acted = np.any(bench.signals.left[: k + 1, -len(names) :] != 0.0, axis=0)
+    acted = np.any(bench.signals.at_begin[: k + 1, -len(names) :] != 0.0, axis=0)
     if alarm is None or alarm.k != k or not alarm.parameter or not acted.any():
         return false, float(k), float("nan")
     return false, float(k), float(not acted[names.index(alarm.parameter)])

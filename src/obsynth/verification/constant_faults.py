@@ -380,9 +380,9 @@ def _grows(plant: DescriptorSystem) -> bool:
     from scipy.linalg import eig
 
     with np.errstate(all="ignore"):
-        poles, left = eig(a, e, left=True, right=False)
+        poles, left_vectors = eig(a, e, left=True, right=False)
     unstable = _unstable(poles, plant.dt)
-    driven = np.abs(left[:, unstable].conj().T @ bf)
+    driven = np.abs(left_vectors[:, unstable].conj().T @ bf)
     return bool(np.any(driven > HIDDEN_MODE_TOLERANCE * np.linalg.norm(bf, axis=0)))
 
 

@@ -637,9 +637,9 @@ def _weights(points: Sequence[Any], *, discrete: bool) -> Any:
     """Return the sums, or integrals, of ``conj(s_i^t) s_j^t`` over the past."""
     count = len(points)
     weights = _zeros(count, count)
-    for i, left in enumerate(points):
-        for j, right in enumerate(points):
-            rate = left.conjugate() * right - 1 if discrete else left.conjugate() + right
+    for i, first in enumerate(points):
+        for j, second in enumerate(points):
+            rate = first.conjugate() * second - 1 if discrete else first.conjugate() + second
             weights[i, j] = 1 / rate
     return weights
 

@@ -313,10 +313,12 @@ class _Composite:
         # From the left, where the rows of fault errors are fewer than the disturbances.
         modal = self._observer_solves
         if modal is None:
-            left = np.concatenate([*resolved(None, self.observer.Az.T, self.outputs.T, points)]).transpose(0, 2, 1)
+            observer_response = np.concatenate([*resolved(None, self.observer.Az.T, self.outputs.T, points)]).transpose(
+                0, 2, 1
+            )
         else:
-            left = modal.rows(points, self.outputs)
-        ages = np.split(left @ self.K + self.J, self.lags, axis=2)
+            observer_response = modal.rows(points, self.outputs)
+        ages = np.split(observer_response @ self.K + self.J, self.lags, axis=2)
         readings = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
         modal = self._plant_solves
         if modal is None:
@@ -324,7 +326,7 @@ class _Composite:
             through = np.linalg.solve(pencils, readings.transpose(0, 2, 1)).transpose(0, 2, 1)
         else:
             through = modal.rows(points, readings)
-        whole = through @ self.plant.Bd + left @ self.driven + self.direct
+        whole = through @ self.plant.Bd + observer_response @ self.driven + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))
         return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
 

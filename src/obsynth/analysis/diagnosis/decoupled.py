@@ -211,7 +211,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], estimated: Sequen
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
-    rows = np.array(part.left)
+    rows = np.array(part.left_factor)
     moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
     rows[part.order :, :nx] = _without_dynamics(rows[part.order :, :nx], moving)
     rows = np.where(np.abs(rows) > ROTATION_ROUNDING, rows, 0.0) * units.rows
@@ -238,7 +238,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], estimated: Sequen
         G=read_only(parts["f"][k:]),
         M=read_only(parts["w"][k:]),
         rows=read_only(rows),
-        states=read_only((part.right / units.columns)[:, :nx]),
+        states=read_only((part.right_factor / units.columns)[:, :nx]),
         removed=finite_values(part) * units.time,
         source=plant,
         faults=tuple(plant.fault_names[i] for i in estimated),
@@ -255,11 +255,11 @@ def _without_dynamics(rows: FloatArray, e: FloatArray) -> FloatArray:
 
     Nothing at all is left of them where E is regular: a reduction of many steps leaves more than the rounding of one.
     """
-    left, values, _ = full_svd(e)
+    left_vectors, values, _ = full_svd(e)
     rank = rank_from(values, expected=len(e)).rank
     if rank == len(e):
         return np.zeros_like(rows)
-    span = left[:, :rank]
+    span = left_vectors[:, :rank]
     return np.asarray(rows - (rows @ span) @ span.T)
 
 

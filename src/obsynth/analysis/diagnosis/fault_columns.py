@@ -247,9 +247,9 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
     independent = _rank(rows)
     for _ in range(n):
         full = np.linalg.norm(rows, 2)
-        left, values, _ = np.linalg.svd(rows[:, n:])
+        left_vectors, values, _ = np.linalg.svd(rows[:, n:])
         rank = rank_from(values, expected=len(rows), scale=float(full)).rank
-        new = left[:, rank:].T @ rows[:, :n]
+        new = left_vectors[:, rank:].T @ rows[:, :n]
         if not new.size or np.linalg.norm(new) <= MARKOV_TOLERANCE * full:
             break
         rows = _compressed(np.vstack([rows, np.hstack([new @ a, new @ f, new @ known])]))

@@ -129,11 +129,11 @@ def _of_degree_zero(
     size = max(largest_singular_value(L), largest_singular_value(K))
     scale = largest_singular_value(C)
     for _ in range(n + 1):
-        left, values, _ = full_svd(w)
+        left_vectors, values, _ = full_svd(w)
         rank = int(np.count_nonzero(values > RANK_TOLERANCE * size))
-        new, hidden, terms = _added_directions(free, rows.combined(left[:, rank:].T), scale)
+        new, hidden, terms = _added_directions(free, rows.combined(left_vectors[:, rank:].T), scale)
         alone |= _present_faults(hidden, terms)
-        rows, w = rows.combined(left[:, :rank].T), left[:, :rank].T @ w
+        rows, w = rows.combined(left_vectors[:, :rank].T), left_vectors[:, :rank].T @ w
         if not len(new.z):
             break
         # Their derivatives hold no derivative of w: they are of degree 0 as well.
@@ -151,7 +151,7 @@ def _added_directions(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, F
         reduced = _Rows(z, f).joined(basis.combined(-share))
         z, f = reduced.z[: len(z)] + reduced.z[len(z) :], reduced.f[: len(z)] + reduced.f[len(z) :]
         terms = terms + np.linalg.norm(np.tensordot(np.abs(share), np.abs(basis.f), axes=1), axis=(0, 1))
-    left, values, right = np.linalg.svd(z, full_matrices=len(z) > z.shape[1])
+    left_vectors, values, right_vectors = np.linalg.svd(z, full_matrices=len(z) > z.shape[1])
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * scale))
-    new = _Rows(right[:rank], np.tensordot(left[:, :rank].T / values[:rank, None], f, axes=1))
-    return new, np.tensordot(left[:, rank:].T, f, axes=1), np.asarray(terms)
+    new = _Rows(right_vectors[:rank], np.tensordot(left_vectors[:, :rank].T / values[:rank, None], f, axes=1))
+    return new, np.tensordot(left_vectors[:, rank:].T, f, axes=1), np.asarray(terms)

@@ -104,8 +104,8 @@ def _norm_outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float6
     """Return the norm of the part of each vector ``(N, m)`` outside the span of columns ``(N, m, c)``."""
     if span.shape[2] == 0:
         return np.asarray(np.linalg.norm(vector, axis=1))
-    left, values, _ = np.linalg.svd(span, full_matrices=False)
-    directions = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], SMALLEST))[:, None, :]
+    left_vectors, values, _ = np.linalg.svd(span, full_matrices=False)
+    directions = left_vectors * (values > RANK_TOLERANCE * np.maximum(values[:, :1], SMALLEST))[:, None, :]
     for _ in range(2):
         vector = vector - np.einsum("nij,nj->ni", directions, np.einsum("nij,ni->nj", directions.conj(), vector))
     return np.asarray(np.linalg.norm(vector, axis=1))

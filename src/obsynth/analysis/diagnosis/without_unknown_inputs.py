@@ -70,20 +70,20 @@ class PencilUnits:
 
 @dataclass(frozen=True, eq=False)
 class LeftPart:
-    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``."""
+    """The left singular part of a pencil: ``left_factor @ (A - sE) = [A_o - s E_o; C_o] @ right_factor``."""
 
     E: FloatArray  # ``(k, k)``, as A
     A: FloatArray
     C: FloatArray  # ``(p, k)``
-    left: FloatArray  # ``(k + p, m)``
-    right: FloatArray  # ``(k, n)``
+    left_factor: FloatArray  # ``(k + p, m)``
+    right_factor: FloatArray  # ``(k, n)``
     Ez: FloatArray  # of the finite zeros, as Az
     Az: FloatArray
     decisions: tuple[RankDecision, ...]
 
     @property
     def order(self) -> int:
-        """Number of states left."""
+        """Number of its states."""
         return int(self.E.shape[0])
 
 
@@ -91,8 +91,8 @@ def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
     """Return the left singular part of a balanced pencil ``(m, n)``."""
     decisions: list[RankDecision] = []
     size_e, size_a = largest_singular_value(E), largest_singular_value(A)
-    left = np.eye(E.shape[0])
-    right = np.eye(E.shape[1])
+    left_factor = np.eye(E.shape[0])
+    right_factor = np.eye(E.shape[1])
     while E.shape[1]:
         _, values, basis = full_svd(E)
         decision = rank_from(values, expected=E.shape[1], scale=size_e)
@@ -105,22 +105,22 @@ def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
         decision = rank_from(values, expected=kernel.shape[1], scale=size_a)
         decisions.append(decision)
         left_null = reached[:, decision.rank :].T
-        E, A, left = left_null @ E @ complement, left_null @ A @ complement, left_null @ left
-        right = complement.T @ right
+        E, A, left_factor = left_null @ E @ complement, left_null @ A @ complement, left_null @ left_factor
+        right_factor = complement.T @ right_factor
     k = E.shape[1]
     rows = np.linalg.svd(E)[0] if k else np.eye(E.shape[0])
     state, output = rows[:, :k].T, rows[:, k:].T
     e, a, c = state @ E, state @ A, output @ A
-    left = np.vstack([state @ left, output @ left])
-    return _without_zeros(e, a, c, left, right, size_a, decisions)
+    left_factor = np.vstack([state @ left_factor, output @ left_factor])
+    return _without_zeros(e, a, c, left_factor, right_factor, size_a, decisions)
 
 
 def _without_zeros(
     e: FloatArray,
     a: FloatArray,
     c: FloatArray,
-    left: FloatArray,
-    right: FloatArray,
+    left_factor: FloatArray,
+    right_factor: FloatArray,
     size: float,
     decisions: list[RankDecision],
 ) -> LeftPart:
@@ -136,17 +136,17 @@ def _without_zeros(
     count = hidden.shape[1]
     if count == 0:
         nothing = np.zeros((0, 0))
-        return LeftPart(e, a, c, left, right, nothing, nothing, tuple(decisions))
+        return LeftPart(e, a, c, left_factor, right_factor, nothing, nothing, tuple(decisions))
     rows = np.linalg.qr(e @ hidden, mode="complete")[0]
     zero, remaining = rows[:, :count].T, rows[:, count:].T
     observable = np.linalg.qr(hidden, mode="complete")[0][:, count:]
-    left = np.vstack([remaining @ left[:k], left[k : k + p]])
+    left_factor = np.vstack([remaining @ left_factor[:k], left_factor[k : k + p]])
     return LeftPart(
         remaining @ e @ observable,
         remaining @ a @ observable,
         c @ observable,
-        left,
-        observable.T @ right,
+        left_factor,
+        observable.T @ right_factor,
         zero @ e @ hidden,
         zero @ a @ hidden,
         tuple(decisions),
@@ -166,7 +166,7 @@ def _invariant(
     turned = rows.T @ (a @ hidden)
     moving, staying, leaving = square[:count], turned[:count], turned[count:]
     while count:
-        left, values, right = np.linalg.svd(leaving, full_matrices=False)
+        left_vectors, values, right_vectors = np.linalg.svd(leaving, full_matrices=False)
         # What has no row of its own is zero but for the rounding of what it is the rest of.
         padded = values if len(leaving) >= count else np.append(values, np.finfo(np.float64).eps * size)
         decision = rank_from(padded, expected=count, scale=size)
@@ -174,9 +174,9 @@ def _invariant(
         rank, count = decision.rank, count - decision.rank
         if rank == 0:
             break
-        turn = _reflection(right[:rank].T)
+        turn = _reflection(right_vectors[:rank].T)
         hidden, moving, staying = (turn(part)[:, rank:] for part in (hidden, moving, staying))
-        still_leaving = turn(left[:, rank:].T @ leaving)[:, rank:]
+        still_leaving = turn(left_vectors[:, rank:].T @ leaving)[:, rank:]
         if count:
             packed, factors, _, _ = dgeqrf(moving)
             moving, staying = (
@@ -190,17 +190,17 @@ def _invariant(
 def _reflection(basis: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Return what turns rows so that the span of an orthonormal basis ``(n, r)`` comes first (block reflector)."""
     count = basis.shape[1]
-    left, values, right = np.linalg.svd(basis[:count])
+    left_vectors, values, right_vectors = np.linalg.svd(basis[:count])
     # [Schreiber, Parlett 1988]: the polar factor's sign that nothing cancels with.
     across = basis.copy()
-    across[:count] += left @ right
-    inner = right.T @ ((right @ across.T) / (1.0 + values)[:, None])
+    across[:count] += left_vectors @ right_vectors
+    inner = right_vectors.T @ ((right_vectors @ across.T) / (1.0 + values)[:, None])
     return lambda matrix: matrix - (matrix @ across) @ inner
 
 
-def finite_values(left: LeftPart) -> ComplexArray:
+def finite_values(part: LeftPart) -> ComplexArray:
     """Return the finite zeros that were taken out, complex, conjugate pairs exact."""
-    if left.Ez.shape[0] == 0:
+    if part.Ez.shape[0] == 0:
         return np.zeros(0, dtype=np.complex128)
-    alpha, beta = pencil_eigenvalues(left.Az, left.Ez)
+    alpha, beta = pencil_eigenvalues(part.Az, part.Ez)
     return np.asarray(alpha / beta, dtype=np.complex128)

@@ -94,8 +94,8 @@ def independent_disturbances(plant: DescriptorSystem) -> tuple[FloatArray, Float
     rank = decide_rank(disturbances).rank
     if rank == plant.nd:
         return plant.Bd, plant.Dd
-    left = np.linalg.svd(disturbances, full_matrices=False)[0][:, :rank]
-    return left[: plant.nx], left[plant.nx :]
+    left_vectors = np.linalg.svd(disturbances, full_matrices=False)[0][:, :rank]
+    return left_vectors[: plant.nx], left_vectors[plant.nx :]
 
 
 def in_disturbances(

@@ -133,9 +133,9 @@ def fixed_modes(plant: DescriptorSystem, decoupled_plant: DecoupledPlant, t: Flo
         pencil = np.hstack([np.vstack([plant.A - zero * plant.E, plant.C]), columns])
         pencil = scale[:, None] * pencil
         sizes = np.linalg.norm(pencil, axis=0)
-        left, values, _ = np.linalg.svd(pencil / np.where(sizes > 0.0, sizes, 1.0))
+        left_vectors, values, _ = np.linalg.svd(pencil / np.where(sizes > 0.0, sizes, 1.0))
         rank = numerical_rank(values, tolerance=MISSED_SHARE)
-        for vector in left[:, rank:].conj().T * scale:
+        for vector in left_vectors[:, rank:].conj().T * scale:
             parts = [vector] if zero.imag == 0.0 else [vector.real, vector.imag]
             new = np.array([part[:nx].real for part in parts])
             if not _adds(rows, new, plant.E * units.states):

@@ -145,7 +145,7 @@ def _equations_without(plant: DescriptorSystem, scaled: _ScaledInputs, V2: Float
     # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
     hidden_effect = scaled.equations * scaled.Bd @ V2
     reached = np.flatnonzero(np.any(hidden_effect != 0.0, axis=1))
-    left, singular_values, _ = np.linalg.svd(hidden_effect[reached])
+    left_vectors, singular_values, _ = np.linalg.svd(hidden_effect[reached])
     removed = numerical_rank(singular_values, scale=1.0)
     if removed == plant.nx:
         raise SpecError(
@@ -157,7 +157,7 @@ def _equations_without(plant: DescriptorSystem, scaled: _ScaledInputs, V2: Float
     if not removed:
         return equations
     combined = np.zeros((len(reached) - removed, plant.nx))
-    combined[:, reached] = left[:, removed:].T * scaled.equations[reached, 0]
+    combined[:, reached] = left_vectors[:, removed:].T * scaled.equations[reached, 0]
     return np.vstack([combined, np.delete(equations, reached, axis=0)])
 
 

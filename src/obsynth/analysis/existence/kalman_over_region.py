@@ -38,8 +38,8 @@ def free_equations(plant: PolytopicSystem) -> FloatArray:
     if not sizes.any():
         return np.eye(plant.nx)
     # Each unknown input has units of its own.
-    left, values, _ = np.linalg.svd(entering[:, sizes > 0.0] / sizes[sizes > 0.0])
-    return np.asarray(left[:, numerical_rank(values) :].T)
+    left_vectors, values, _ = np.linalg.svd(entering[:, sizes > 0.0] / sizes[sizes > 0.0])
+    return np.asarray(left_vectors[:, numerical_rank(values) :].T)
 
 
 def _in_order(plant: PolytopicSystem) -> Iterator[Condition]:

@@ -123,8 +123,8 @@ class NamedPencil:
         matrix = a - (point if point.imag else point.real) * e
         scaled = self.rows[:, None] * matrix * self.columns
         sizes = np.abs(scaled) if self.terms is None else self.rows[:, None] * self.terms * self.columns
-        left, values, _ = np.linalg.svd(scaled[:, :-1], full_matrices=False)
-        basis = left[:, values > RANK_TOLERANCE * np.max(values, initial=0.0)]
+        left_vectors, values, _ = np.linalg.svd(scaled[:, :-1], full_matrices=False)
+        basis = left_vectors[:, values > RANK_TOLERANCE * np.max(values, initial=0.0)]
         remainder = scaled[:, -1] - basis @ (basis.conj().T @ scaled[:, -1])
         size = float(np.linalg.norm(sizes[:, -1]))
         return float(np.linalg.norm(remainder)) / size if size > 0.0 else 0.0

@@ -96,10 +96,10 @@ class PlantNumbers:
         with self._with_many_bits():
             return matrix if self.exact else arb_mat(matrix)
 
-    def product(self, left: Any, right: Any) -> Any:
+    def product(self, first: Any, second: Any) -> Any:
         """Return a product."""
         with self._with_many_bits():
-            return left * right
+            return first * second
 
     def rank(self, matrix: Any) -> int:
         """Return the rank of a matrix; of enclosures to digits."""

@@ -39,11 +39,11 @@ def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, Flo
     solved = np.linalg.solve(r, q.T)
     solved = solved + (np.eye(e.shape[1]) - solved @ stacked) @ solved
     t, n = solved[:, : e.shape[0]], solved[:, e.shape[0] :]
-    left, values, right = np.linalg.svd(e)
+    left_vectors, values, right_vectors = np.linalg.svd(e)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if values[0] > 0.0 else 0
     if rank == e.shape[0]:
         return t, n
-    left_null, null = left[:, rank:], right[rank:].T
+    left_null, null = left_vectors[:, rank:], right_vectors[rank:].T
     k = np.linalg.qr(c.T @ (c @ null))[0]
     u, _, v = np.linalg.svd(k.T @ left_null)
     return t + k @ (u @ v) @ left_null.T, n

@@ -142,9 +142,9 @@ def _corrections(rows: FloatArray, target: FloatArray, rank: int) -> tuple[Float
     Equations in units of their own are as many as the rank counts; what is beyond it is rounding, and no direction."""
     units = np.linalg.norm(rows, axis=0)
     units = np.where(units > 0.0, units, 1.0)
-    left, sizes, right = np.linalg.svd(rows / units)
-    K0 = (target / units) @ (right[:rank].T / sizes[:rank]) @ left[:, :rank].T
-    return np.asarray(K0), np.asarray(left[:, rank:])
+    left_vectors, sizes, right_vectors = np.linalg.svd(rows / units)
+    K0 = (target / units) @ (right_vectors[:rank].T / sizes[:rank]) @ left_vectors[:, :rank].T
+    return np.asarray(K0), np.asarray(left_vectors[:, rank:])
 
 
 def _equations(C: FloatArray, driven: list[FloatArray]) -> tuple[FloatArray, FloatArray]:

@@ -237,11 +237,11 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
     )
     values = least(grid)
     at = int(np.argmin(values))
-    left, right = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+    lower, upper = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
     for _ in range(GRID_REFINEMENTS):
-        inner = np.linspace(left, right, 5)
+        inner = np.linspace(lower, upper, 5)
         best = int(np.argmin(least(inner)))
-        left, right = inner[max(best - 1, 0)], inner[min(best + 1, 4)]
-    place = 0.5 * (left + right)
+        lower, upper = inner[max(best - 1, 0)], inner[min(best + 1, 4)]
+    place = 0.5 * (lower + upper)
     value = float(least(np.array([place]))[0])
     return (value, float(place)) if value < values[at] else (float(values[at]), float(grid[at]))

@@ -179,15 +179,15 @@ def _criterion(
             return np.broadcast_to(np.eye(size, dtype=complex), (len(points), size, size))
         return _response(model if plant.is_discrete else cayley(*model, alpha), points)
 
-    left, noise = response(weights.errors, len(one)), response(weights.noise, plant.nw)
+    left_weight, noise = response(weights.errors, len(one)), response(weights.noise, plant.nw)
     if matched is None:
-        return Criterion(angles, shares, left, noise, np.zeros((1, len(one), plant.nw), dtype=complex))
-    right = np.zeros((len(points), plant.nf + plant.nw, plant.nf + plant.nw), dtype=complex)
-    right[:, : plant.nf, : plant.nf] = response(weights.faults, plant.nf)
-    right[:, plant.nf :, plant.nf :] = noise
+        return Criterion(angles, shares, left_weight, noise, np.zeros((1, len(one), plant.nw), dtype=complex))
+    right_weight = np.zeros((len(points), plant.nf + plant.nw, plant.nf + plant.nw), dtype=complex)
+    right_weight[:, : plant.nf, : plant.nf] = response(weights.faults, plant.nf)
+    right_weight[:, plant.nf :, plant.nf :] = noise
     target = np.zeros((len(points), len(one), plant.nf + plant.nw), dtype=complex)
     target[:, :, : plant.nf] = _response(matched, points)
-    return Criterion(angles, shares, left, right, target)
+    return Criterion(angles, shares, left_weight, right_weight, target)
 
 
 def _response(model: Model, points: ComplexArray) -> ComplexArray:

@@ -271,8 +271,8 @@ def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: 
     if TIME_HEADER in missing and (advice := time_advice(header)):
         return advice
     meant = next((name for name in header if name.casefold() == column.casefold()), "YOUR_COLUMN")
-    question = suggestion(column, header)
-    return f"{question} {mapping_advice(signal, meant)}".lstrip()
+    suggested = suggestion(column, header)
+    return f"{suggested} {mapping_advice(signal, meant)}".lstrip()
 
 
 def mapping_advice(signal: str, column: str = "YOUR_COLUMN") -> str:

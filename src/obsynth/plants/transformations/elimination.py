@@ -272,9 +272,9 @@ def _dynamic_count(plant: DescriptorSystem) -> int:
 def _coordinates(plant: DescriptorSystem, count: int) -> tuple[FloatArray, FloatArray, FloatArray, tuple[str, ...]]:
     """Return row transformation, bases of dynamic and algebraic states, names of the dynamic ones."""
     units = PlantUnits.of(plant).rounded()
-    left, _, right = np.linalg.svd(in_own_units(plant)[0])
+    left_vectors, _, right_vectors = np.linalg.svd(in_own_units(plant)[0])
     moving_rows, moving = plant.E.any(axis=1), plant.E.any(axis=0)
-    rows = left.T
+    rows = left_vectors.T
     if np.sum(moving_rows) == count:
         rows = np.eye(plant.nx)[np.argsort(~moving_rows, kind="stable")]
     rows = rows * units.equations
@@ -282,7 +282,7 @@ def _coordinates(plant: DescriptorSystem, count: int) -> tuple[FloatArray, Float
         order = np.argsort(~moving, kind="stable")
         basis, names = np.eye(plant.nx)[:, order], tuple(plant.state_names[i] for i in order[:count])
     else:
-        directions = np.hstack([settled_basis(right[:count].T), right[count:].T])
+        directions = np.hstack([settled_basis(right_vectors[:count].T), right_vectors[count:].T])
         basis, names = units.states[:, None] * directions, tuple(f"xi {i + 1}" for i in range(count))
     return rows, basis[:, :count], basis[:, count:], names
 

@@ -224,8 +224,8 @@ class _Writer:
             return str(node.name()), _ATOM
         operation, inner = node.op(), [node.dep(i) for i in range(node.n_dep())]
         if operation in self.operators:
-            sign, left, right = self.operators[operation]
-            return f"{self._in(inner[0], left)} {sign} {self._in(inner[1], right)}", min(left, _POWER)
+            sign, left_level, right_level = self.operators[operation]
+            return f"{self._in(inner[0], left_level)} {sign} {self._in(inner[1], right_level)}", min(left_level, _POWER)
         if operation in self.functions:
             return f"{self.functions[operation]}({', '.join(self._written(item)[0] for item in inner)})", _ATOM
         if operation in (*self.comparisons, ca.OP_NOT):
@@ -244,8 +244,8 @@ class _Writer:
         if condition.op() == self.ca.OP_NOT:
             return self._chosen(condition.dep(0), second, first)
         sign = self.comparisons[condition.op()]
-        left, right = (self._written(condition.dep(i))[0] for i in range(2))
-        return f"where({left} {sign} {right}, {first}, {second})"
+        left_side, right_side = (self._written(condition.dep(i))[0] for i in range(2))
+        return f"where({left_side} {sign} {right_side}, {first}, {second})"
 
 
 def _number(value: float) -> tuple[str, int]:

@@ -71,12 +71,12 @@ def equilibrium(
     residual, jacobian = problem.scaled(z)
     if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
         raise problem.undefined(residual, jacobian)
-    left, values, right = np.linalg.svd(jacobian)
+    left_vectors, values, right_vectors = np.linalg.svd(jacobian)
     rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.size else 0
     if not np.abs(residual).max(initial=0.0) <= ROOT_RESIDUAL:
-        raise problem.without_root(residual, left[:, rank:])
+        raise problem.without_root(residual, left_vectors[:, rank:])
     if rank < len(problem.names):
-        raise problem.not_unique(right[rank:])
+        raise problem.not_unique(right_vectors[rank:])
     return problem.point(z)
 
 
@@ -194,9 +194,9 @@ class _Problem:
             signals=bad,
         )
 
-    def without_root(self, residual: FloatArray, left: FloatArray) -> PreconditionError:
+    def without_root(self, residual: FloatArray, left_null: FloatArray) -> PreconditionError:
         """Return the refusal: what is left, and the combination of equations that no unknown changes."""
-        fixed = left @ (left.T @ residual)
+        fixed = left_null @ (left_null.T @ residual)
         names, combination = self._combination(fixed * self.weights)
         rest = ", ".join(
             f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
@@ -251,9 +251,9 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
             break
         weights = _row_weights(np.hstack([local.E * sizes, local.by_state * sizes]))
         E = weights[:, None] * (local.E * sizes)
-        left, values, _ = np.linalg.svd(E)
+        left_vectors, values, _ = np.linalg.svd(E)
         rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.any() else 0
-        null = left[:, rank:]
+        null = left_vectors[:, rank:]
         x = x + sizes * _algebraic_step(
             null.T @ (weights[:, None] * local.by_state * sizes), -null.T @ (weights * local.value), E, movable
         )

@@ -95,12 +95,12 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
     pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
     if not pivots:
         return None
-    null, left = null_basis(e), null_basis(e.transpose()).transpose()
+    null, left_null = null_basis(e), null_basis(e.transpose()).transpose()
     signals = [written_matrix(getattr(plant, name)) for name in _EXACT_INPUTS]
     whole = identity(plant.nx)
     keep, take = picked_columns(whole, pivots), picked_rows(whole, rows)
     right = blocks([[a * keep, *signals]])
-    coupling = left * a * null
+    coupling = left_null * a * null
     if plant.nx > len(pivots) and coupling.det() == 0:
         return None
     direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _EXACT_DIRECT)]])
@@ -111,9 +111,9 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
     sizes = [np.zeros((int(part.nrows()), int(part.ncols()))) for part in (moving, direct)]
     if sized:
         with np.errstate(all="ignore"):
-            sizes = _term_sizes((left, right), coupling, (take, a * null), (direct, c * null), leading, inverses)
+            sizes = _term_sizes((left_null, right), coupling, (take, a * null), (direct, c * null), leading, inverses)
     if plant.nx > len(pivots):
-        algebraic = _solved_exactly(-coupling, left * right, inverses[0] if clean else None)
+        algebraic = _solved_exactly(-coupling, left_null * right, inverses[0] if clean else None)
         moving = _sum(moving, take * (a * null), algebraic, clean=clean)
         direct = _sum(direct, c * null, algebraic, clean=clean)
         states = _sum(states, null, algebraic, clean=clean)
@@ -140,12 +140,12 @@ def _term_sizes(
 ) -> list[FloatArray]:
     """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs.
     ``inverses``: sizes of the inverses of ``coupling`` and ``moving``."""
-    (left, right), (take, across), (direct, output) = constraints, equations, outputs
+    (left_null, right), (take, across), (direct, output) = constraints, equations, outputs
     solver, inverse = inverses
     dynamic = _sizes(take) @ _sizes(right)
     if not coupling.nrows():
         return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)]
-    algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left) @ _sizes(right))))
+    algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left_null) @ _sizes(right))))
     dynamic = dynamic + _sizes(take * across) @ algebraic
     return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(output) @ algebraic]
 

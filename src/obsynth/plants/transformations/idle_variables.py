@@ -137,10 +137,10 @@ def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
         return True
     arrays = part.toarray()
     pencil = equilibrate_pencil(np.zeros_like(arrays), arrays)
-    left, values, _ = np.linalg.svd(pencil.A)
+    left_vectors, values, _ = np.linalg.svd(pencil.A)
     rank = int(np.sum(values > RANK_TOLERANCE * np.max(values, initial=np.finfo(float).tiny)))
     # Else these combinations of them are a condition on the others, and leaving them out would not be exact.
-    return _say_nothing(plant, rows, pencil.rows, left[:, rank:])
+    return _say_nothing(plant, rows, pencil.rows, left_vectors[:, rank:])
 
 
 def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:

@@ -217,8 +217,8 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     pencil = shift * e - a
     moved = np.linalg.solve(pencil, e)
     # The kernel of the power, and its image, which has the index as its exponent or more.
-    left, _, right = np.linalg.svd(np.linalg.matrix_power(moved, structure_of(plant).index or 1))
-    image, nilpotent = left[:, :count], right[count:].T
+    left_vectors, _, right_vectors = np.linalg.svd(np.linalg.matrix_power(moved, structure_of(plant).index or 1))
+    image, nilpotent = left_vectors[:, :count], right_vectors[count:].T
     rows = sorted(int(row) for row in scipy.linalg.qr(image.T, mode="r", pivoting=True)[1][:count])
     dynamic = np.linalg.solve(image[rows].T, image.T).T
     basis = np.hstack([dynamic, nilpotent])

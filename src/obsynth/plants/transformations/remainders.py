@@ -179,7 +179,7 @@ def _remainders(
     texts: Any = model.equations
     parsed = [equation_of(text, f"equations.{name}") for name, text in texts.items()]
     still = {key: zero for expression in parsed for key in expression.rates}
-    left = [zero.lifted(expression.translated({**known, **still}, translation)) for expression in parsed]
+    residuals = [zero.lifted(expression.translated({**known, **still}, translation)) for expression in parsed]
     seen_texts: Any = model.outputs
     output_values = [
         zero.lifted(equation_of(text, f"outputs.{name}").translated(known, translation))
@@ -189,8 +189,8 @@ def _remainders(
     into = np.hstack([linear.A, linear.B, linear.Bf, linear.Bd])
     out = np.hstack([linear.C, linear.D, linear.Df, linear.Dd])
     point = np.array([linear.operating_point.get(name, 0.0) for name in linear.output_names])
-    equations = [_missed(-value, row, 0.0, middles, halves) for value, row in zip(left, into, strict=True)]
-    rates = [COEFFICIENT_ROUNDINGS * UNIT_ROUNDOFF * value.magnitude for value in left]
+    equations = [_missed(-value, row, 0.0, middles, halves) for value, row in zip(residuals, into, strict=True)]
+    rates = [COEFFICIENT_ROUNDINGS * UNIT_ROUNDOFF * value.magnitude for value in residuals]
     outputs = [_missed(value, row, y, middles, halves) for value, row, y in zip(output_values, out, point, strict=True)]
     return np.array(equations) + np.array(rates), np.array(outputs)
 

@@ -153,18 +153,18 @@ class _Pieces:
         if block.shape == (1, 1):
             whole_rows = whole_columns = abs(block[0, 0]) > RANK_TOLERANCE * norm
             rank = int(whole_rows)
-            left, right, values = np.ones((1, 1)), np.ones((1, 1)), np.abs(block[0])
+            left_vectors, right_vectors, values = np.ones((1, 1)), np.ones((1, 1)), np.abs(block[0])
         else:
-            left, values, right = np.linalg.svd(block)
+            left_vectors, values, right_vectors = np.linalg.svd(block)
             rank = numerical_rank(values, scale=norm)
             whole_rows, whole_columns = rank == len(rows), rank == len(columns)
             if not whole_columns:
-                right[:rank] = settled_basis(right[:rank].T).T
+                right_vectors[:rank] = settled_basis(right_vectors[:rank].T).T
         for k in range(rank, len(values)):
             if values[k] > len(values) * np.finfo(float).eps * values[0]:
-                self.neglected.append(int(columns[np.argmax(np.abs(right[k]))]))
-        self._put(self.dynamic_rows, self.algebraic_rows, rows, left.T * row_scale, rank, whole=whole_rows)
-        self._put(self.dynamic, self.algebraic, columns, right * column_scale, rank, whole=whole_columns)
+                self.neglected.append(int(columns[np.argmax(np.abs(right_vectors[k]))]))
+        self._put(self.dynamic_rows, self.algebraic_rows, rows, left_vectors.T * row_scale, rank, whole=whole_rows)
+        self._put(self.dynamic, self.algebraic, columns, right_vectors * column_scale, rank, whole=whole_columns)
 
     def _put(self, target: Any, others: Any, places: Any, basis: FloatArray, rank: int, *, whole: bool) -> None:
         if whole:
@@ -214,13 +214,13 @@ def not_index_one(
     (_, algebraic_rows, _, algebraic), _, _ = split_by_derivatives(part)
     inner = csr(algebraic_rows @ csr(part.A) @ algebraic)
     factor = sparse_factor(inner)
-    smallest, left, right = factor.null_vectors()
+    smallest, left_null, right_null = factor.null_vectors()
     if not factor.exactly_singular and smallest > RANK_TOLERANCE:
         return said or PreconditionError("", condition="index")
     generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
     regular = any(not verdict.singular for verdict in generic)
     if regular:
-        equations, variables = _leading(algebraic_rows, algebraic, left, right, inner)
+        equations, variables = _leading(algebraic_rows, algebraic, left_null, right_null, inner)
     else:
         equations, variables = map(_named, generic[0].null_vectors()[1:])
     # As the plant was given: equations and variables that were left out count.
@@ -246,14 +246,14 @@ def not_index_one(
     )
 
 
-def _leading(rows: Any, basis: Any, left: FloatArray, right: FloatArray, inner: Any) -> tuple[Any, Any]:
+def _leading(rows: Any, basis: Any, left_null: FloatArray, right_null: FloatArray, inner: Any) -> tuple[Any, Any]:
     """Return the equations and variables of the null vectors; by the pattern alone, where that is singular already."""
     coarse = coarse_structure(inner)
     if coarse.structural_rank < inner.shape[0]:
         over, under = np.zeros(inner.shape[0]), np.zeros(inner.shape[0])
         over[coarse.over_rows], under[coarse.under_columns] = 1.0, 1.0
         return _named(abs(rows).T @ over), _named(abs(basis) @ under)
-    return _named(abs(rows).T @ left), _named(abs(basis) @ right)
+    return _named(abs(rows).T @ left_null), _named(abs(basis) @ right_null)
 
 
 def _named(shares: FloatArray) -> Any:

@@ -237,13 +237,13 @@ def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = 
     """Return what disturbances and noise add to channels and outputs, over the whole box (or the tolerances alone)."""
     disturbances, (inner, state, outputs) = structure.disturbances, structure.rows
 
-    def total(left: FloatArray, direct: AffineMatrix) -> FloatArray:
-        gains = responses.gain(left, disturbances.center[inner], direct.center) * float(center)
+    def total(left_factor: FloatArray, direct: AffineMatrix) -> FloatArray:
+        gains = responses.gain(left_factor, disturbances.center[inner], direct.center) * float(center)
         for part, at_once in zip(disturbances.parts, direct.parts, strict=True):
             if part.any():
-                gains = gains + responses.gain(left, part[inner], at_once)
+                gains = gains + responses.gain(left_factor, part[inner], at_once)
         if disturbances.radius.any():
-            gains = gains + responses.absolute_gain(left, disturbances.radius[inner]) + direct.radius
+            gains = gains + responses.absolute_gain(left_factor, disturbances.radius[inner]) + direct.radius
         return np.asarray(gains @ structure.bounds * OUTWARD)
 
     rows = structure.channel_rows
@@ -269,8 +269,8 @@ def _rounding(
     picked = absolute(structure.watching)
     rows = structure.channel_rows
 
-    def spread(left: FloatArray, direct: FloatArray, into: FloatArray) -> FloatArray:
-        return np.asarray(size * (responses.absolute_gain(left, into) + direct))
+    def spread(left_factor: FloatArray, direct: FloatArray, into: FloatArray) -> FloatArray:
+        return np.asarray(size * (responses.absolute_gain(left_factor, into) + direct))
 
     reading = absolute(rows) @ absolute(structure.reading)
     channels = spread(rows @ structure.Cx, reading @ read, pushed)
@@ -280,9 +280,9 @@ def _rounding(
         both = np.hstack([part, known])
         largest_psi = responses.gain(eye, both[inner])
         into = absolute(structure.Az) @ largest_psi + absolute(both[inner])
-        for left, direct, total in (
+        for left_factor, direct, total in (
             (rows @ structure.Cx, absolute(rows) @ absolute(both[at_state]), channels),
             (structure.Co, absolute(both[outputs]), output_rounding),
         ):
-            total[:, order] += spread(left, direct + absolute(left) @ largest_psi, into)
+            total[:, order] += spread(left_factor, direct + absolute(left_factor) @ largest_psi, into)
     return np.vstack([structure.channel_sizes(channels), output_rounding]) * OUTWARD

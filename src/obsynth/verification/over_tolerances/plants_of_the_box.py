@@ -181,8 +181,10 @@ def acting_like_faults(plant: DescriptorSystem) -> tuple[str, ...]:
 
 def _range(effects: FloatArray) -> FloatArray:
     """Return unit columns that span what a constant does to equations and outputs."""
-    left, values, _ = np.linalg.svd(effects)
-    return np.asarray(left[:, : int(np.sum(values > DIRECTION_SHARE * max(values[0], np.finfo(np.float64).tiny)))])
+    left_vectors, values, _ = np.linalg.svd(effects)
+    return np.asarray(
+        left_vectors[:, : int(np.sum(values > DIRECTION_SHARE * max(values[0], np.finfo(np.float64).tiny)))]
+    )
 
 
 def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDesign, DescriptorSystem]:

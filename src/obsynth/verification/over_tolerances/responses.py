@@ -58,30 +58,32 @@ class Responses:
         older = self.tail_channels @ (self.repeated @ gathered[:, m + no :].T)
         return np.asarray((self.same + gathered[:, :m].T + older) * OUTWARD)
 
-    def gain(self, left: FloatArray, right: FloatArray, direct: FloatArray | None = None) -> FloatArray:
-        """Return an upper bound of ``|direct| + sum_j |left Az^j right|``, entry by entry."""
-        moved = self.powers[:-1] @ right
-        older = np.abs(left @ self.powers[-1]) @ (self.repeated @ np.abs(moved).sum(axis=0))
-        rounding = self.length * power_rounding(left, self.powers) @ np.abs(right)
-        total = np.abs(left @ moved).sum(axis=0) + older + rounding
+    def gain(self, left_factor: FloatArray, right_factor: FloatArray, direct: FloatArray | None = None) -> FloatArray:
+        """Return an upper bound of ``|direct| + sum_j |left_factor Az^j right_factor|``, entry by entry."""
+        moved = self.powers[:-1] @ right_factor
+        older = np.abs(left_factor @ self.powers[-1]) @ (self.repeated @ np.abs(moved).sum(axis=0))
+        rounding = self.length * power_rounding(left_factor, self.powers) @ np.abs(right_factor)
+        total = np.abs(left_factor @ moved).sum(axis=0) + older + rounding
         return np.asarray((total if direct is None else total + np.abs(direct)) * OUTWARD)
 
-    def absolute_gain(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """Return an upper bound of ``sum_j |left Az^j| right`` for a nonnegative ``right``."""
-        sums = np.abs(left @ self.powers[:-1]).sum(axis=0)
+    def absolute_gain(self, left_factor: FloatArray, right_factor: FloatArray) -> FloatArray:
+        """Return an upper bound of ``sum_j |left_factor Az^j| right_factor`` for a nonnegative ``right_factor``."""
+        sums = np.abs(left_factor @ self.powers[:-1]).sum(axis=0)
         size = np.abs(self.powers[:-1]).sum(axis=0)
-        rounding = self.length * power_rounding(left, self.powers)
-        return np.asarray((sums + rounding + np.abs(left @ self.powers[-1]) @ self.repeated @ size) @ right * OUTWARD)
+        rounding = self.length * power_rounding(left_factor, self.powers)
+        return np.asarray(
+            (sums + rounding + np.abs(left_factor @ self.powers[-1]) @ self.repeated @ size) @ right_factor * OUTWARD
+        )
 
 
-def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return a bound of what rounding of the powers changes in ``left Az^j``, for all j.
+def power_rounding(left_factor: FloatArray, powers: FloatArray) -> FloatArray:
+    """Return a bound of what rounding of the powers changes in ``left_factor Az^j``, for all j.
 
     With ``P(j+1) = Az P(j) + F(j)`` as computed, ``Az^j - P(j)`` is the sum of ``Az^(j-1-i) F(i)``.
     """
     largest, size = np.abs(powers).max(axis=0), gamma(len(powers[0]) + 2)
-    later = np.abs(left @ powers).sum(axis=0) @ np.abs(powers[min(1, len(powers) - 1)])
-    return np.asarray(2.0 * size * (later + np.abs(left)) @ largest)
+    later = np.abs(left_factor @ powers).sum(axis=0) @ np.abs(powers[min(1, len(powers) - 1)])
+    return np.asarray(2.0 * size * (later + np.abs(left_factor)) @ largest)
 
 
 def ring_length(az: FloatArray) -> int:
@@ -141,10 +143,10 @@ def responses_of(structure: ErrorStructure) -> Responses:
     )
 
 
-def _plain(structure: ErrorStructure, left: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return ``|left Az^j b|`` (absolute values inside for remainders) for all j."""
+def _plain(structure: ErrorStructure, left_factor: FloatArray, powers: FloatArray) -> FloatArray:
+    """Return ``|left_factor Az^j b|`` (absolute values inside for remainders) for all j."""
     own, inner = len(structure.owner), structure.effects[structure.rows[0]]
-    responses, slack = left @ powers, power_rounding(left, powers)
+    responses, slack = left_factor @ powers, power_rounding(left_factor, powers)
     sizes = np.concatenate([np.abs(responses @ inner[:, :own]), np.abs(responses) @ np.abs(inner[:, own:])], axis=2)
     return np.asarray(sizes + slack @ np.abs(inner))
 
@@ -205,19 +207,19 @@ def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: floa
 
 def blame(responses: Responses) -> FloatArray:
     """Return the share of each constant in the loop's radius, remainders last: its Perron vectors."""
-    left, right = _perron(responses.loop)
+    left_vector, right_vector = _perron(responses.loop)
     structure = responses.structure
     shares = np.zeros(structure.state.count + 1)
     owner = np.full(structure.channels, structure.state.count)
     owner[: len(structure.owner)] = structure.owner
-    np.add.at(shares, owner, (left @ responses.loop) * right)
+    np.add.at(shares, owner, (left_vector @ responses.loop) * right_vector)
     return _as_shares(shares)
 
 
 def blamed_rows(responses: Responses, tracking: FloatArray, parts: tuple[FloatArray, ...]) -> FloatArray:
     """Return the share of each row of the plant ``(nx,)`` in the loop; ``parts (p, nx, n)`` of E and A."""
     structure = responses.structure
-    left, right = _perron(responses.loop)
+    left_vector, right_vector = _perron(responses.loop)
     into = structure.channel_sizes(responses.gain(structure.channel_rows @ structure.Cx, tracking))
     shares = np.zeros(tracking.shape[1])
     for i in sorted(set(structure.owner)):
@@ -226,7 +228,7 @@ def blamed_rows(responses: Responses, tracking: FloatArray, parts: tuple[FloatAr
         for part in parts:
             width = part[i].shape[1]
             effect = np.abs(part[i] @ np.linalg.pinv(rows[:, :width]))
-            shares += (left @ into) * (effect @ right[chosen])
+            shares += (left_vector @ into) * (effect @ right_vector[chosen])
     return _as_shares(shares)
 
 
@@ -240,9 +242,9 @@ def _perron(loop: FloatArray) -> tuple[FloatArray, FloatArray]:
     size = float(loop.max(initial=0.0))
     if size == 0.0:
         return np.ones(len(loop)), np.ones(len(loop))
-    values, right = np.linalg.eig(loop + _LOOP_SHIFT * size)
-    transposed, left = np.linalg.eig(loop.T + _LOOP_SHIFT * size)
+    values, right_vectors = np.linalg.eig(loop + _LOOP_SHIFT * size)
+    transposed, left_vectors = np.linalg.eig(loop.T + _LOOP_SHIFT * size)
     return (
-        np.abs(left[:, int(np.argmax(transposed.real))].real),
-        np.abs(right[:, int(np.argmax(values.real))].real),
+        np.abs(left_vectors[:, int(np.argmax(transposed.real))].real),
+        np.abs(right_vectors[:, int(np.argmax(values.real))].real),
     )
