@@ -275,7 +275,9 @@ def filter_of_samples(plant: WrittenPlant, delay: int, *, noise: bool = False) -
 
     def response(w: np.ndarray, points: np.ndarray) -> np.ndarray:
         turned = np.exp(-1j * np.outer(points, np.arange(TAPS - 1, -1, -1)))
-        return np.asarray(np.einsum("pt,...td->...pd", turned, (w.T @ flat).reshape(*w.T.shape[:-1], TAPS, -1)))
+        return np.asarray(
+            np.einsum("pt,...td->...pd", turned, (w.T @ flat).reshape(*w.T.shape[:-1], TAPS, seen.shape[-1]))
+        )
 
     points = np.linspace(0.0, np.pi, GRID)
     given, moves, share = response(first, points), response(free, points), np.full(GRID, 1.0 / GRID)

@@ -43,6 +43,7 @@ NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
         (LINEAR.replace(Bd=np.eye(3), Dd=np.zeros((2, 3))), "descriptor-kalman", {}, "drive every equation"),
         (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {}, "free of noise"),
         (LINEAR.replace(dt=0.0, A=-LINEAR.A), "functional-filter", {"delay": 2}, "count samples"),
+        (LINEAR.replace(dt=0.0, A=-LINEAR.A), "optimal-filter", {"delay": 2}, "discrete time"),
     ],
 )
 def test_check_tells_what_is_not_stated(plant: Any, method: str, options: dict[str, Any], words: str) -> None:
@@ -77,6 +78,35 @@ def test_options_of_auto_are_those_of_every_method_that_has_them() -> None:
     named = ob.check(plant, {"functional-filter": {"fault_model": {"sinusoid": 0.5}}})
     assert sine["functional-filter"].passed == named["functional-filter"].passed
     assert sine["functional-filter"].passed != step["functional-filter"].passed
+
+
+def test_no_finite_mean_square_is_a_no_of_check_too() -> None:
+    plant = ob.DescriptorSystem(A=[[-1.0]], C=[[1.0]], Bf=[[1.0]], Bw=[[0.0]], Dw=[[0.1]])
+    reference = {"bandwidth": 2.0, "order": 2}
+    assert [row.name for row in ob.check(plant, {"optimal-filter": {"norm": "h2"}})["optimal-filter"].failures] == [
+        "exists: finite mean square"
+    ]
+    with pytest.raises(ob.PreconditionError, match="mean square is infinite"):
+        ob.optimal_filter(plant, norm="h2")
+    assert ob.check(plant, {"optimal-filter": {"norm": "h2", "reference": reference}})["optimal-filter"].passed
+    assert ob.optimal_filter(plant, norm="h2", reference=reference).report.passed
+
+
+def test_a_filter_that_keeps_too_few_digits_is_not_said_to_not_exist() -> None:
+    """With noise added to every output the equations of this plant have no solution, without it they have one."""
+    plant = ob.DescriptorSystem(
+        A=[[-1.0, 0.0, -1.0, 1.0], [1.0, 0.0, 1.0, 0.5], [-1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]],
+        C=[[-2.0, 0.0, 0.0, 0.0], [1.0, 0.0, -2.0, 0.0]],
+        Bf=[[0.0], [0.0], [0.0], [1.0]],
+        Bd=[[2.0, 0.0], [0.0, 1.0], [-2.0, 0.0], [0.0, 0.0]],
+        Dd=[[0.0, 0.0], [1.0, -2.0]],
+        Bw=np.zeros((4, 2)),
+        Dw=0.1 * np.eye(2),
+        dt=1.0,
+    )
+    assert ob.check(plant)["optimal-filter"].passed
+    with pytest.raises(ob.SolverError, match="inconclusive"):
+        ob.optimal_filter(plant)
 
 
 def test_command_for_a_nonlinear_plant(

@@ -53,6 +53,10 @@ class Options(Protocol):
         """A reference model, or ``None``."""
 
     @property
+    def norm(self) -> str:
+        """``hinf`` or ``h2``."""
+
+    @property
     def exact(self) -> bool:
         """Whether faults pass exactly by the fault map."""
 
@@ -147,7 +151,29 @@ def conditions(plant: DescriptorSystem, options: Options) -> tuple[Condition, ..
         first_problem_or_driven(plant, options)
     except PreconditionError as error:
         return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error))
-    return first, Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
+    second = Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
+    if options.norm != "h2" or plant.is_discrete:
+        return first, second
+    return first, second, _finite_mean_square(plant, options)
+
+
+def _finite_mean_square(plant: DescriptorSystem, options: Options) -> Condition:
+    """Return whether the least mean square is finite and the Riccati equation of its filter has a solution."""
+    claim, holds, detail, of_ours = "some filter has a finite mean square, by a Riccati equation", True, "", False
+    try:
+        try:
+            least_mean_square(first_problem(plant, options)[1])
+        except PreconditionError:
+            if with_lasting_modes_driven(plant) is plant:
+                raise
+            fault_map, _ = first_problem_or_driven(plant, options)
+            least_deviation_of_every_start(plant, fault_map, options.weights)
+    except (PreconditionError, np.linalg.LinAlgError) as error:
+        holds, detail = False, str(error)
+        of_ours = not (isinstance(error, PreconditionError) and error.condition == "finite mean square")
+    return Condition(
+        "finite mean square", claim, holds, float(holds), 1.0, _SOURCE, detail=detail, of_the_method=of_ours
+    )
 
 
 def first_problem_or_driven(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, EstimationProblem]:

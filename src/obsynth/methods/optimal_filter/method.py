@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
+from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, plain
 from obsynth.methods.optimal_filter.delays import is_auto
 from obsynth.numerics.arguments import Count, OpenUnitInterval, WrittenAs
@@ -161,6 +162,13 @@ class OptimalFilterMethod(Method):
         from obsynth.methods.optimal_filter.fault_maps import conditions
 
         return conditions(plant, self)
+
+    def require_stated(self, plant: DescriptorSystem) -> None:
+        """Raise `SpecError` for a delay in samples where the plant is continuous."""
+        if not is_auto(self.delay) and not plant.is_discrete:
+            raise SpecError(
+                "A delay in samples is for discrete time: give a reference model.", path=f"{OPTIONS_PATH}.delay"
+            )
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:
