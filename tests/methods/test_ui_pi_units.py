@@ -181,3 +181,15 @@ def test_a_fault_at_the_end_of_a_long_chain_is_not_denied_an_observer() -> None:
     # Units of A made links of 0.03 as large as the diagonal, and the fault of no effect beside rounding.
     plant = slow_chain(39, 0.9969, 0.1015, [0, 32], 6)
     assert all(condition.holds for condition in existence_conditions(plant, exosystem("step", plant.fault_names, 1.0)))
+
+
+@pytest.mark.parametrize(("dt", "mode"), [(0.0, -40.0), (1.0, 1e-3)])
+def test_a_fast_state_that_no_output_shows_does_not_hurry_the_default(dt: float, mode: float) -> None:
+    alone = DescriptorSystem(
+        A=[[0.4 if dt else -1.0]], Bf=[[1.0]], C=[[1.0]], sensor_noise={"y1": 0.1}, dt=dt,
+    )  # fmt: skip
+    beside = DescriptorSystem(
+        A=[[0.4 if dt else -1.0, 0.0], [0.0, mode]], Bf=[[1.0], [0.0]], C=[[1.0, 0.0]], sensor_noise={"y1": 0.1}, dt=dt,
+    )  # fmt: skip
+    decays = [ui_pi_observer(plant).certificate.claims["decay"] for plant in (alone, beside)]
+    assert decays[1] < 1.3 * decays[0]

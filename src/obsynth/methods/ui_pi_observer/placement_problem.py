@@ -110,7 +110,7 @@ def placement_problem(
         C=c,
         free=free,
         split=split,
-        rate=_own_rate(scaled, split.F),
+        rate=_own_rate(scaled, split),
     )
 
 
@@ -141,17 +141,27 @@ def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, paper_matrices
     return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), undisturbed, injection)
 
 
-def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
-    """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
-    structure = structure_of(plant)
-    size = largest_singular_value(f)
-    for values in (structure.finite_eigenvalues, eigenvalues(f)):
+def _own_rate(plant: DescriptorSystem, split: ObservableSplit) -> float:
+    """Return the median speed of the modes that the outputs show; of the pair's where there are none; or its size."""
+    size = largest_singular_value(split.F)
+    # A plant's mode that no output shows is fixed: without fixed modes there is none.
+    shown = _shown_modes(plant) if split.fixed_modes.size else structure_of(plant).finite_eigenvalues
+    for values in (shown, eigenvalues(split.F)):
         speeds = moving_speeds(values, plant.dt, 1.0 / plant.dt if plant.dt > 0.0 else 0.0)
         speeds = speeds[speeds > DEAD_BEAT]
         if speeds.size and (plant.dt > 0.0 or np.max(speeds) > INTEGRATOR_SCATTER * size):
             median = float(np.median(speeds))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
+
+
+def _shown_modes(plant: DescriptorSystem) -> ComplexArray:
+    """Return the finite modes of a plant without those that no output shows, such as that of a state beside it."""
+    modes = structure_of(plant).finite_eigenvalues
+    hidden = finite_zeros(np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])).values
+    for value in hidden[: len(modes)]:
+        modes = np.delete(modes, np.argmin(np.abs(modes - value)))
+    return modes
 
 
 def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> KalmanProblem:
