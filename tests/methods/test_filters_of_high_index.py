@@ -1,4 +1,5 @@
-"""Optimal filters of sampled plants of index 2 or more, whose outputs show inputs of later samples."""
+"""Optimal filters of plants of index 2 or more: of sampled ones, whose outputs show inputs of later samples, and of
+continuous ones, whose outputs show derivatives."""
 
 from __future__ import annotations
 
@@ -32,6 +33,34 @@ def scrambled(seed: int, index: int) -> obsynth.DescriptorSystem:
     return obsynth.DescriptorSystem(
         E=left @ e @ right, A=left @ a @ right, C=c, Bf=bf, dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1}
     )
+
+
+def turned(seed: int, count: int) -> obsynth.DescriptorSystem:
+    """Return a continuous plant of index 3 with so many finite modes, in random coordinates."""
+    rng = np.random.default_rng([3, seed, count])
+    modes = rng.standard_normal((count, count))
+    modes -= (max(np.linalg.eigvals(modes).real) + 0.3) * np.eye(count)
+    e, a = block_diag(np.eye(count), np.eye(3, k=1)), block_diag(modes, np.eye(3))
+    left, right = rng.standard_normal((2, len(e), len(e)))
+    return obsynth.DescriptorSystem(
+        E=left @ e @ right,
+        A=left @ a @ right,
+        C=rng.standard_normal((3, len(e))),
+        Bf=rng.standard_normal((len(e), 1)),
+        Bw=np.hstack([0.1 * rng.standard_normal((len(e), 2)), np.zeros((len(e), 3))]),
+        Dw=np.hstack([np.zeros((3, 2)), 0.1 * np.eye(3)]),
+    )
+
+
+@pytest.mark.parametrize(("seed", "count"), [(2, 3), (1, 5)])
+def test_infinite_modes_of_index_3_that_come_out_of_qz_as_fast_ones_place_no_cayley_point(
+    seed: int, count: int
+) -> None:
+    design = obsynth.optimal_filter(turned(seed, count))
+    assert design.report.passed
+    assert 0.0 < design.least <= design.gain < design.least * (1 + 3e-5)
+    lag = -np.array(design.options["reference"]["A"])[0, 0]
+    assert lag < 10.0  # rad/s, near the finite modes; with infinite ones among them some hundred
 
 
 @pytest.mark.parametrize(("delay", "truth"), [(0, 1.0), (1, 0.5**0.5)])

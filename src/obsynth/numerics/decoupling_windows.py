@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import cayley, cayley_point, reachable_basis, standard_form
 from obsynth.numerics.unseen_inputs import seen_part
@@ -102,6 +102,7 @@ def estimation_problem(
     delay: int | Sequence[int] | None = None,
     reference: Model | None = None,
     exact: bool = True,
+    poles: ComplexArray | None = None,
 ) -> EstimationProblem:
     """Return the problem of estimation of a plant.
 
@@ -115,6 +116,8 @@ def estimation_problem(
         A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults (of the delayed ones).
     exact : bool, optional
         Whether faults pass exactly by the fault map; otherwise they drive the error beside w (model matching).
+    poles : ComplexArray, optional
+        Finite poles of the plant, which place the Cayley point; by default all eigenvalues of its pencil.
 
     Raises
     ------
@@ -122,8 +125,10 @@ def estimation_problem(
         No causal filter has this fault map, or the unknown inputs cannot be decoupled in this form.
     """
     point = None
-    if plant.dt == 0.0 and reference is not None and reference[0].size:
-        point = cayley_point(scipy.linalg.eigvals(plant.A, plant.E), np.linalg.eigvals(reference[0]))
+    if plant.dt == 0.0:
+        own = scipy.linalg.eigvals(plant.A, plant.E) if poles is None else poles
+        lags = np.linalg.eigvals(reference[0]) if reference is not None and reference[0].size else own[:0]
+        point = cayley_point(own, lags)
     inputs, through = np.hstack([plant.Bf, plant.Bd, plant.Bw]), np.hstack([plant.Df, plant.Dd, plant.Dw])
     form = standard_form(plant.E, plant.A, inputs, plant.C, through, plant.dt, alpha=point)
     nf, nd = plant.Bf.shape[1], plant.Bd.shape[1]

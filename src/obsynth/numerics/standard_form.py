@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 
 #: Infinite eigenvalues of index 3 come out of QZ near ``eps^(-1/3)``: beyond this an eigenvalue is infinite.
 INFINITE_EIGENVALUE = 1e4
@@ -64,6 +64,16 @@ def cayley_point(*poles: Any) -> float:
     sizes = sizes[np.isfinite(sizes)]
     sizes = sizes[(sizes > SLOWEST_POLE) & (sizes < FASTEST_POLE)]
     return CAYLEY_DETUNING * (float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0)
+
+
+def finite_poles(e: FloatArray, a: FloatArray, count: int) -> ComplexArray:
+    """Return the ``count`` smallest eigenvalues of a pencil: the finite ones, where the staircase counted so many.
+
+    QZ returns infinite ones of index 3 near 1e5, and of higher index nearer: no bound on their moduli parts them.
+    """
+    poles = scipy.linalg.eigvals(a, e)
+    order = np.argsort(np.where(np.isfinite(poles), np.abs(poles), np.inf), kind="stable")
+    return np.asarray(poles[np.sort(order[:count])], dtype=np.complex128)
 
 
 def standard_form(

@@ -8,7 +8,6 @@ from functools import reduce
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import scipy.linalg
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
@@ -27,9 +26,9 @@ from obsynth.numerics.least_estimation import (
     require_stable_filter,
 )
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.standard_form import cayley, cayley_point, uncayley
+from obsynth.numerics.standard_form import cayley, cayley_point, finite_poles, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.pencil import regularity_of
+from obsynth.plants.pencil import regularity_of, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.fault_map_zeros import require_vanishing
 from obsynth.verification.invisible_faults import Setting, seen_plant
@@ -221,7 +220,7 @@ def _unweighted_maps(plant: DescriptorSystem, options: Options) -> Iterator[Faul
         tried = range(plant.nx + 2 if None in delays else 1)
         yield from (FaultMap(tuple(late if one is None else one for one in delays), None, True) for late in tried)
     else:
-        width = cayley_point(scipy.linalg.eigvals(plant.A, plant.E))
+        width = cayley_point(_finite_poles(plant, plant.E, plant.A))
         yield from (FaultMap(None, lag_model(width, order, plant.nf, 0.0), True) for order in range(1, plant.nx + 2))
 
 
@@ -248,16 +247,24 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     own, units = _units_of(plant)
     channels, each = channels_of(plant, fault_map)
     models = fault_map.setting.models
+    poles = None if plant.is_discrete else _finite_poles(plant, channels.E, channels.A)
     if not models:
-        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
+        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact, poles=poles)
         weights = (own.faults / units.error)[:, None]
         problem = replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
     else:
         a, b, c, d = reduce(in_series, models)
         scaled = (a, b * each, c / units.error, d * each / units.error)
-        problem = estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
+        problem = estimation_problem(
+            channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact, poles=poles
+        )
     driving = np.arange(problem.B.shape[1]) < problem.B.shape[1] - fault_map.undriven
     return replace(problem, B=problem.B * driving, D=problem.D * driving, D1=problem.D1 * driving)
+
+
+def _finite_poles(plant: DescriptorSystem, e: FloatArray, a: FloatArray) -> ComplexArray:
+    """Return the finite poles of a plant's pencil, given in some units, as many as its structure has."""
+    return finite_poles(e, a, len(structure_of(plant).finite_eigenvalues))
 
 
 def channels_of(plant: DescriptorSystem, fault_map: FaultMap) -> tuple[Channels, FloatArray]:
