@@ -88,8 +88,8 @@ def test_a_time_invariant_plant_states_its_noise() -> None:
     assert isinstance(design.plant, TimeVaryingDescriptorSystem)
     np.testing.assert_allclose(design.observer.Q.at(0), np.diag([0.01, 0.04, 0.09]))
     np.testing.assert_allclose(design.observer.R.at(0), np.diag([0.16, 0.25]))
-    with pytest.raises(SpecError, match="drives equations and outputs at once"):
-        obsynth.descriptor_kalman(plant.replace(Dw=np.ones((2, 5))))
+    with pytest.raises(SpecError, match="R is not stated, and cannot be taken from the plant's noise alone"):
+        obsynth.descriptor_kalman(plant.replace(Dw=np.ones((2, 5))), Q=1)
     assert obsynth.descriptor_kalman(plant.replace(Dw=np.ones((2, 5))), Q=1, R=1).report.passed
     bare = obsynth.descriptor_kalman(plant.replace(Bw=None, Dw=None, noise_names=None))
     assert "No noise is stated: Q and R taken as the identity" in bare.notes[0]

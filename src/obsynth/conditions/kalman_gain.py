@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.analysis.existence.kalman import kalman_conditions, with_stated_noise, without_unknown_inputs
+from obsynth.analysis.existence.shared_noise import shared_noise
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
@@ -167,6 +168,8 @@ def _gain_data(varying: TimeVaryingDescriptorSystem, process: FloatArray, sensor
 
 def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray]:
     """Return the plant without unknown inputs, with covariances of its equations and of its outputs."""
+    shared = shared_noise(own, Q=Q, R=R)
+    own = own if shared is None else shared.plant
     options = with_stated_noise(own, {"Q": Q, "R": R})
     q = 1.0 if options["Q"] is None else options["Q"]
     if own.nd:

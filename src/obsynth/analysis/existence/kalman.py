@@ -197,9 +197,9 @@ def with_stated_noise(
         return resolved
     if np.any(product_but_rounding(plant.Bw, plant.Dw.T)):
         raise SpecError(
-            "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does not "
-            "cover: state independent noises, or give Q and R.",
-            path="Dw",
+            f"{missing[0]} is not stated, and cannot be taken from the plant's noise alone, which drives equations and "
+            "outputs at once (Bw Dw' is not zero): state neither Q nor R, or both.",
+            path=missing[0],
         )
     for name, matrix in (("Q", plant.Bw), ("R", plant.Dw)):
         if resolved[name] is None:

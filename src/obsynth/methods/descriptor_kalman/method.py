@@ -38,9 +38,11 @@ class DescriptorKalman(Method):
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity
-        (in natural units where the plant's are far from these).  Of a plant of index 2 or more, which is reduced, a
-        constant one of the equations as written is carried to the free states (it is refused where noise in a
-        constraint would be needed at another time), as are ``initial_state`` and ``initial_covariance``.
+        (in natural units where the plant's are far from these).  Noise of a plant that drives equations and outputs at
+        once, ``Bw Dw'`` not zero, becomes states of the filter, which are estimated, where neither Q nor R is stated.
+        Of a plant of index 2 or more, which is reduced, a constant one of the equations as written is carried to the
+        free states (it is refused where noise in a constraint would be needed at another time), as are
+        ``initial_state`` and ``initial_covariance``.
     R : MatrixLike, optional
         Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
     initial_state : array_like, optional
@@ -162,8 +164,10 @@ class DescriptorKalman(Method):
             NoiseOverRegion.of(plant, self.Q, self.R)
             return
         from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
+        from obsynth.analysis.existence.shared_noise import shared_noise
 
-        with_stated_noise(plant, self.as_given())
+        if shared_noise(plant, Q=self.Q, R=self.R) is None:
+            with_stated_noise(plant, self.as_given())
         if isinstance(plant, DescriptorSystem) and plant.nd:
             without_unknown_inputs(plant)
 

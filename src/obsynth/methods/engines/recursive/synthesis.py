@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import require_all
 from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
 from obsynth.analysis.existence.recursive import detectability_condition
+from obsynth.analysis.existence.shared_noise import shared_noise
 from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
 from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
@@ -41,7 +42,29 @@ def synthesise(
     """Put the observer together; see `obsynth.descriptor_kalman` and `obsynth.adaptive_observer`."""
     progress("checking the existence conditions along the horizon")
     require_all(method.existence(plant))
-    options = with_stated_noise(plant, method.as_given())
+    options = method.as_given()
+    shared = shared_noise(plant, Q=options["Q"], R=options["R"])
+    if shared is None or not isinstance(plant, DescriptorSystem):
+        return _with_independent_noises(plant, options, progress=progress)
+    units = PlantUnits.of(plant)
+    if options["initial_covariance"] is None and units.spread > FAR_UNITS:
+        options["initial_covariance"] = np.diag(units.rounded().states ** 2)
+    options |= {
+        "initial_state": shared.initial_state(options["initial_state"]),
+        "initial_covariance": shared.initial_covariance(options["initial_covariance"]),
+    }
+    synthesis = _with_independent_noises(shared.plant, options, progress=progress)
+    return replace(synthesis, notes=(shared.note, *synthesis.notes))
+
+
+def _with_independent_noises(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    stated: Mapping[str, Any],
+    *,
+    progress: Callable[[str], None],
+) -> Synthesis:
+    """Put the observer together for a plant of which no noise drives equations and outputs at once."""
+    options = with_stated_noise(plant, stated)
     if options.get("guard", "") is None:
         options["guard"] = "none" if options["form"] == "literal" else "regularise"
     progress("computing the gains")
