@@ -213,7 +213,7 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(_PUBLIC_HOMES[name]), name)
     if name in _PUBLIC_PACKAGES:
         return import_module(f"obsynth.{name}")
-    from obsynth.plants.signal_names import suggestion
+    from obsynth.numerics.suggestions import suggestion
 
     close = suggestion(name, __all__) if not name.startswith("_") else ""
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}.{close}".removesuffix("."))

@@ -44,7 +44,7 @@ __all__ = sorted(_PICTURE_HOMES)
 def __getattr__(name: str) -> Any:
     if name in _PICTURE_HOMES:
         return getattr(import_module(_PICTURE_HOMES[name]), name)
-    from obsynth.plants.signal_names import suggestion
+    from obsynth.numerics.suggestions import suggestion
 
     close = suggestion(name, __all__) if not name.startswith("_") else ""
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}.{close}".removesuffix("."))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -10,7 +13,8 @@ import pytest
 import obsynth
 from obsynth.cli.examples import EXAMPLES
 from obsynth.cli.main import VERBS, main, obsynth_parser
-from obsynth.plants.signal_names import suggestion
+from obsynth.methods.registry import REGISTRY
+from obsynth.numerics.suggestions import suggestion
 
 ROOT = Path(__file__).parents[2]
 THERMAL = ROOT / "docs/examples/thermal/spec.yaml"
@@ -265,8 +269,8 @@ def test_a_column_that_is_missing_is_mapped_by_its_signal(words: list[str], told
 def test_an_argument_by_another_name_is_asked_about(wrong: str, meant: str) -> None:
     with pytest.raises(TypeError) as raised:
         obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], **{wrong: None})  # type: ignore[arg-type]
-    question = f" Did you mean {meant}?" if meant else ""
-    assert str(raised.value) == f"DescriptorSystem has no argument {wrong!r}.{question}"
+    advice = f" Did you mean {meant}?" if meant else " There are: A, B, Bd, Bf"
+    assert str(raised.value).startswith(f"DescriptorSystem has no argument {wrong!r}.{advice}")
 
 
 def test_one_name_and_one_number_are_told_how_they_are_written() -> None:
@@ -277,3 +281,44 @@ def test_one_name_and_one_number_are_told_how_they_are_written() -> None:
     with pytest.raises(obsynth.SpecError, match=r"needs a profile, such as obsynth\.Step\(size=2\), or a list"):
         obsynth.Scenario(horizon=3, faults={"f1": 2.0})  # type: ignore[dict-item]
     assert obsynth.Scenario(horizon=3, faults={"f1": obsynth.Step(size=2)}).faults
+
+
+#: Their keyword arguments are options, which `SpecError` names.
+METHOD_FUNCTIONS = [
+    getattr(obsynth, method.replace("-", "_")) for method in REGISTRY if hasattr(obsynth, method.replace("-", "_"))
+]
+
+#: Functions whose further arguments are options of methods, matrices or signals: these have messages of their own.
+TAKES_ANY = inspect.Parameter.VAR_KEYWORD
+
+
+@pytest.mark.parametrize("module", ["", ".conditions", ".plotting"])
+def test_every_public_name_suggests_the_nearest_keyword(module: str) -> None:
+    public, checked = import_module(f"obsynth{module}"), 0
+    for name in public.__all__:
+        made = getattr(public, name)
+        if not callable(made) or (isinstance(made, type) and issubclass(made, Exception)):
+            continue
+        stated = inspect.signature(made).parameters.values()
+        keywords = [each.name for each in stated if each.kind in (each.KEYWORD_ONLY, each.POSITIONAL_OR_KEYWORD)]
+        if not keywords or made in METHOD_FUNCTIONS or any(each.kind is TAKES_ANY for each in stated):
+            continue
+        longest = max(keywords, key=len)
+        with pytest.raises(TypeError, match=rf"has no argument '{longest}x'\. Did you mean '{longest}'"):
+            made(**{f"{longest}x": None})
+        checked += 1
+    assert checked > 10
+
+
+@pytest.mark.parametrize("designed", METHOD_FUNCTIONS, ids=lambda function: function.__name__)
+def test_every_method_suggests_the_nearest_option(designed: Callable[..., object]) -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    option = max(set(inspect.signature(designed).parameters) - {"plant", "name"}, key=len)
+    with pytest.raises(obsynth.SpecError, match=rf"has no option '{option}x'.*Did you mean '{option}'"):
+        designed(plant, **{f"{option}x": None})
+
+
+def test_an_option_that_no_method_has_is_named() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match=r"No method has the option 'gama'\. Did you mean 'gamma'"):
+        obsynth.design(plant, gama=2.0)

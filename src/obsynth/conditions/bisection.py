@@ -12,6 +12,8 @@ from typing import Literal
 
 import numpy as np
 
+from obsynth.numerics.suggestions import fields_suggested
+
 #: Levels of one sign whose ratio is above this are halved on a logarithmic scale.
 GEOMETRIC_RATIO = 4.0
 
@@ -24,6 +26,7 @@ MOST_HALVINGS = 60
 Answer = Literal["feasible", "infeasible", "unknown"]
 
 
+@fields_suggested
 @dataclass(frozen=True)
 class Bisection:
     """Where conditions change from feasible to infeasible, as far as a solver finds out.

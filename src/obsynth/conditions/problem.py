@@ -18,6 +18,7 @@ from obsynth.conditions.options import VIOLATION_SHARE
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.numerics.arguments import arguments_checked, real_number, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.results.design import ObserverDesign
 from obsynth.results.registered import registered
 from obsynth.results.verification_report import VerificationReport, failed_rows
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 Values = Mapping[str, FloatArray]
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False, repr=False)
 class Conditions:
     """The conditions of a paper as a `cvxpy.Problem`, with everything in it by name.

@@ -30,6 +30,7 @@ from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.proofs.extended_balls import Enclosed
 from obsynth.proofs.slope_blocks import SlopeBlock
 from obsynth.results.design import ObserverDesign
@@ -39,6 +40,7 @@ from obsynth.verification.error_polytope import ErrorPolytope
 MOST_IN_FULL_MULTIPLIER = 6
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class SlopedErrors:
     """An error system with slopes between -1 and 1.

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.existence.condition import without_opening
+from obsynth.analysis.existence.condition import OPTIONS_PATH, without_opening
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
 from obsynth.numerics.arguments import field_types
+from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.recursive.steady_observer import steady_observer
@@ -189,6 +190,17 @@ def _methods_with(purpose: Purpose, among: Iterable[str]) -> list[str]:
     return [method for method in among if purpose in method_class(method).purposes]
 
 
+def _no_method_with(options: Iterable[str]) -> SpecError:
+    known = {name for method in linear_methods() for name in field_types(method)}
+    unknown = next((name for name in sorted(options) if name not in known), None)
+    text = (
+        f"No single method has the options {', '.join(sorted(options))}: name the method they are for."
+        if unknown is None
+        else f"No method has the option {unknown!r}.{suggestion(unknown, sorted(known))}"
+    )
+    return SpecError(text, path=OPTIONS_PATH)
+
+
 def automatic_design(
     plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker, scenario: Scenario | None = None
 ) -> ObserverDesign:
@@ -200,10 +212,7 @@ def automatic_design(
         return maker(plant, next(iter(_methods_with(purpose, known)), known[0]), options)
     possible = [method.id for method in linear_methods() if set(options) <= set(field_types(method))]
     if not possible:
-        raise SpecError(
-            f"No single method has the options {', '.join(sorted(options))}: name the method they are for.",
-            path="method.options",
-        )
+        raise _no_method_with(options)
     if plant.nf == 0:
         order: list[Purpose] = ["state despite unknown inputs", "state despite noise"]
         if plant.nw and not plant.nd:

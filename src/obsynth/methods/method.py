@@ -15,10 +15,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import field_types, problem_with, without_axes
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion
+from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import FaultModel
-from obsynth.plants.signal_names import suggestion
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.checks import Check

@@ -10,10 +10,10 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError, a_kind
 from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.signal_names import suggestion
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel

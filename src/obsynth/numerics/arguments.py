@@ -21,6 +21,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from obsynth.errors import SpecError, a_kind, counted
 from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
 from obsynth.numerics.quantities import require_plain
+from obsynth.numerics.suggestions import keyword_names, require_keywords
 
 #: Messages give the number of digits of whole numbers beyond this.
 LONGEST_SHOWN = 10**30
@@ -448,10 +449,11 @@ def arguments_worded(**words: str) -> Callable[[Callable[Given, Returned]], Call
     """Return `arguments_checked` with what to give for some arguments in words of the function's own."""
 
     def checked(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
-        stated = signature(function)
+        stated, known = signature(function), keyword_names(function)
 
         @wraps(function)
         def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+            require_keywords(kwargs, known, function.__name__)
             kinds = argument_kinds(function)
             arguments = dict(zip(stated.parameters, args, strict=False)) | kwargs
             wrong = {

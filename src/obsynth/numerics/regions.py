@@ -16,8 +16,10 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, real_number, shown
 from obsynth.numerics.arrays import FloatArray, freeze
+from obsynth.numerics.suggestions import fields_suggested
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class LMIRegion:
     """A region of the complex plane: all z with ``L + z M + conj(z) M' < 0``; open, convex, symmetric to the real axis.

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.dae_signals import finite_vector
-from obsynth.plants.signal_names import index_of, suggestion
+from obsynth.plants.signal_names import index_of
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")

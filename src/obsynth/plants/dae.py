@@ -26,6 +26,7 @@ from obsynth.plants.checking import Problems, checked_units
 from obsynth.plants.dae_checks import check_distinct, check_structure
 from obsynth.plants.dae_equations import EQUALS
 from obsynth.plants.dae_fields import DAEFields, Equations
+from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.signal_names import checked_names
 
 #: Names that mean something else in the language.
@@ -95,6 +96,7 @@ class DAEModel(DAEFields):
        2013, (3)-(4).  There h does not depend on theta only in the derivation; (21) needs it, and we allow it.
     """
 
+    @plant_keywords_suggested
     def __init__(
         self,
         equations: Equations,

@@ -12,7 +12,7 @@ from obsynth.numerics.arguments import is_finite_number, number_in_text, require
 from obsynth.numerics.arrays import require_no_overflow
 from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.numerics.quantities import in_seconds
-from obsynth.plants.signal_names import suggestion
+from obsynth.numerics.suggestions import suggestion
 
 #: Seconds in the units of time that a text may have.
 SECONDS_IN_UNIT: Mapping[str, float] = {

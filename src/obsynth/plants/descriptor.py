@@ -16,7 +16,7 @@ from obsynth.numerics.sparse import dense, is_sparse, same_matrix
 from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, exact_numbers
 from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, plant_fields
-from obsynth.plants.other_names import keywords_suggested
+from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
 #: Larger plants as written are not stored with a design: their elimination is checked where it is done.
@@ -142,7 +142,7 @@ class DescriptorSystem:
     uncertainty: Uncertainty | None
     exact: ExactNumbers | None
 
-    @keywords_suggested
+    @plant_keywords_suggested
     def __init__(
         self,
         E: ArrayLike | None = None,

@@ -18,6 +18,7 @@ from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value, read_only
 from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.suggestions import fields_suggested, keywords_suggested
 from obsynth.plants.signal_names import index_of
 
 #: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:
@@ -79,6 +80,7 @@ def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(matrix * states / states[:, None]), states
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class FaultModel:
     """The model ``xi' = Phi xi, f = Cw xi`` of one fault f; `obsynth.fault_model` makes those with names.
@@ -192,6 +194,7 @@ def summed(models: Sequence[FaultModel]) -> FaultModel:
     return _observable(FaultModel(phi, row, description, models[0].sampled))
 
 
+@keywords_suggested
 def fault_model(data: Any) -> FaultModel:
     """Return a model from data: a word, a mapping such as ``{sinusoid: 1.5}``, or a model itself.
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import wraps
-from inspect import signature
 from typing import ParamSpec, TypeVar
 
-from obsynth.plants.signal_names import suggestion
+from obsynth.numerics.suggestions import keywords_suggested, suggestion
 
 Given = ParamSpec("Given")
 
@@ -35,16 +33,6 @@ def name_meant(name: str, known: Iterable[str], present: Iterable[str] = ()) -> 
     return suggestion(name, names)
 
 
-def keywords_suggested(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
-    """Return a constructor that asks about keyword arguments which it does not have, as Python's `TypeError`."""
-    parameters = tuple(signature(function).parameters)[1:]
-
-    @wraps(function)
-    def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-        unknown = next((name for name in kwargs if name not in parameters), None)
-        if unknown is not None:
-            name = function.__qualname__.partition(".")[0]
-            raise TypeError(f"{name} has no argument {unknown!r}.{name_meant(unknown, parameters, kwargs)}")
-        return function(*args, **kwargs)
-
-    return called
+def plant_keywords_suggested(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+    """Return a constructor of a plant that suggests names for keyword arguments which it does not have."""
+    return keywords_suggested(function, name_meant)

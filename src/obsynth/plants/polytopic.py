@@ -22,6 +22,7 @@ from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of
 from obsynth.plants.uncertainty import expressions_in
 
@@ -89,6 +90,7 @@ class PolytopicSystem:
     scheduling: Scheduling
     shift: str | None
 
+    @plant_keywords_suggested
     def __init__(
         self,
         vertices: Sequence[DescriptorSystem] | None = None,

@@ -1,8 +1,7 @@
-"""Names of signals: unique ones, suggestions for wrong ones, and picking by name."""
+"""Names of signals: unique ones, and picking by name."""
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import unicodedata
 from collections import Counter
@@ -14,15 +13,13 @@ import numpy as np
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NAMED_SHARE
+from obsynth.numerics.suggestions import suggestion
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
 
 #: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
 _UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
-
-#: A name that misses a wrong one by more than this many times the miss of the closest name is not suggested.
-MUCH_FARTHER = 2.5
 
 #: Argument with names -> what it names, as a message counts it: one, many.
 _COUNTED = {
@@ -33,9 +30,6 @@ _COUNTED = {
     "disturbance_names": ("unknown input (column of Bd and Dd)", "unknown inputs (columns of Bd and Dd)"),
     "noise_names": ("noise input (column of Bw and Dw)", "noise inputs (columns of Bw and Dw)"),
 }
-
-#: So many letters of a name are taken as its beginning.
-LEAST_BEGINNING = 3
 
 
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:
@@ -106,23 +100,6 @@ def listed(texts: Sequence[str], *, most: int = 6) -> str:
 
 def _there_are(names: Sequence[str]) -> str:
     return f" There are: {listed(names)}." if names else " There are none."
-
-
-def suggestion(name: str, names: Iterable[str]) -> str:
-    """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
-    known = list(names)
-    close = _closest(str(name), known)
-    if not close and len(str(name)) >= LEAST_BEGINNING:
-        close = [other for other in known if other.startswith(str(name))][:3]
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-
-
-def _closest(name: str, known: Sequence[str]) -> list[str]:
-    """Return at most three names that are close to a wrong one, without those that are much farther than the best."""
-    alike = [other for other in known if other.casefold() == name.casefold()]
-    close = alike or difflib.get_close_matches(name, known, n=3)
-    missed = [1.0 - difflib.SequenceMatcher(None, other, name).ratio() for other in close]
-    return [other for other, miss in zip(close, missed, strict=True) if miss <= MUCH_FARTHER * missed[0]]
 
 
 def require_known(names: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.plants.checking import Problems, checked_labels
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.sequences import (
     LAYOUT,
     MatrixSequence,
@@ -104,6 +105,7 @@ class TimeVaryingDescriptorSystem:
     scales: Mapping[str, float]
     units: Mapping[str, str]
 
+    @plant_keywords_suggested
     def __init__(
         self,
         E: MatrixLike,

@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError, VerificationError
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
@@ -42,6 +43,7 @@ OfPlant = TypeVar("OfPlant")
 _MOST_NAMED_CHECKS = 4
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class Certificate:
     """Matrices and claims from which a design can be rechecked without a solver.
@@ -71,6 +73,7 @@ class Certificate:
         freeze(self, "claims", matrices={name: read_only(matrix) for name, matrix in self.matrices.items()})
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False, repr=False)
 class ObserverDesign:
     """A finished design: gains to read, an observer to run, a certificate and a report.

@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.results.checks import Check, all_hold
 
 
+@fields_suggested
 @dataclass(frozen=True)
 class VerificationReport:
     """All checks of one design; an empty report fails.

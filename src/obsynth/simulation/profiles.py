@@ -17,6 +17,7 @@ from annotated_types import Gt, Le
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import OpenUnitInterval, Positive, check_fields, is_finite_number, is_number, shown
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
+from obsynth.numerics.suggestions import fields_suggested
 
 #: Share of a sample by which rounding may move a start or an end.
 SAMPLE_SLACK = 1e-6
@@ -64,6 +65,7 @@ class Additive(Profile, ABC):
         return at_begin, at_begin.copy() if self.held else np.where(acts, values[1:], 0.0)
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Step(Additive):
     """A constant; on a sensor, its bias.
@@ -94,6 +96,7 @@ class Step(Additive):
         return np.full(time.shape, float(self.size))
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Ramp(Additive):
     """A straight line from zero at ``start``; linear between samples.
@@ -125,6 +128,7 @@ class Ramp(Additive):
         return np.asarray(self.rate * (time - self.start))
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Sine(Additive):
     """``amplitude sin(frequency t + phase)``, t the scenario's time; linear between samples.
@@ -162,6 +166,7 @@ class Sine(Additive):
         return np.asarray(self.amplitude * np.sin(self.frequency * time + self.phase))
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Drift(Additive):
     """A slow approach to ``size``, with a time constant; linear between samples.
@@ -197,6 +202,7 @@ class Drift(Additive):
         return np.asarray(-self.size * np.expm1(-np.maximum(time - self.start, 0.0) / self.time_constant))
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Intermittent(Additive):
     """A constant that is there in a part of each period, and zero in the rest.
@@ -234,6 +240,7 @@ class Intermittent(Additive):
         return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Stuck(Profile):
     """An actuator or a sensor that is stuck at one value.
@@ -261,6 +268,7 @@ class Stuck(Profile):
     value: float | None = None
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class LostEffectiveness(Profile):
     """An actuator or a sensor that gives only a share of its signal.
@@ -300,6 +308,7 @@ class Random(Profile, ABC):
         """Return the largest absolute value (infinite if there is none), the mean and the variance."""
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Uniform(Random):
     """Independent samples, uniform between two limits (a bias is their mean), held between samples.
@@ -339,6 +348,7 @@ class Uniform(Random):
         return max(abs(self.low), abs(self.high)), (self.low + self.high) / 2, (self.high - self.low) ** 2 / 12
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Gaussian(Random):
     """Independent normal samples, held between samples.

@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
@@ -73,6 +74,7 @@ _GROUP_NAMES = {
 Profiles = Mapping[str, Profile | Sequence[Profile]]
 
 
+@fields_suggested
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
     """The inputs, faults, disturbances and noise of a simulation, by signal; several profiles of one signal add up.

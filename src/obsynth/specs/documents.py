@@ -13,8 +13,8 @@ from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
 from obsynth.methods.registry import AUTO, REGISTRY, method_class
 from obsynth.numerics.arguments import field_types, is_whole
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.other_names import name_meant
-from obsynth.plants.signal_names import suggestion
 from obsynth.specs.lines import composed, line_of
 from obsynth.specs.remedies import (
     instead_of_list,

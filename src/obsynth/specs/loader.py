@@ -12,6 +12,7 @@ from obsynth.files.inputs import path_of
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.libraries import one_thread_if_small
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from obsynth.specs.schema_sections import DAESection
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class Spec:
     """A spec, read and checked.

@@ -16,6 +16,7 @@ from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.report.plots.panels import (
     LINE_COLOURS,
     TRUE_STYLE,
@@ -290,6 +291,7 @@ def short_delay(delay: tuple[int, float]) -> str:
     return f"{number(mean)} s" + (f" ({missing} without one)" if missing else "")
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """All methods side by side on one clock; made by `compare`.

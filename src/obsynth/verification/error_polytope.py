@@ -19,10 +19,12 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.proofs.vertex_inequalities import Vertex
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class ErrorPolytope:
     """Vertices of an error system.

@@ -16,6 +16,7 @@ from obsynth.methods.guaranteed_test.window_bounds import free_faults
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import measured_record
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False, repr=False)
 class GuaranteedTest(ObserverDesign):
     """A design by `guaranteed_test`: its threshold, the fault that it is certain to detect, and its table of samples.

@@ -10,6 +10,7 @@ from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import design_function
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.results.design import ObserverDesign, describe_parameters
 from obsynth.results.layout import number
 from obsynth.results.registered import registered
@@ -46,6 +47,7 @@ class TradeOff(tuple[DelayChoice, ...]):
         return html_table(self.rows())
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False, repr=False)
 class OptimalFilter(ObserverDesign):
     """The design of a fault-estimation filter that no causal filter beats, with what proves it.

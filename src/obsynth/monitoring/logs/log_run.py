@@ -30,11 +30,11 @@ from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
 from obsynth.monitoring.thresholds.watched_columns import as_learned
 from obsynth.numerics.arguments import is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import BY_COLUMNS
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.signal_names import suggestion
 from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import digest_of, plain, restored

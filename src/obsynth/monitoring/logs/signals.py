@@ -17,8 +17,8 @@ from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.measurement_units import MICRO_SIGNS, conversion
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
-from obsynth.plants.signal_names import suggestion
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
 _TIME_OF_DAY = re.compile(

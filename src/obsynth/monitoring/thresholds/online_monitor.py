@@ -28,12 +28,12 @@ from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
+from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.constants import shown
 from obsynth.plants.noise import is_noise_assumed, require_noise
-from obsynth.plants.signal_names import suggestion
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.assumptions import Assumptions

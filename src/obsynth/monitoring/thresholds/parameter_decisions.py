@@ -24,6 +24,7 @@ from obsynth.monitoring.thresholds.parameter_rule import (
 )
 from obsynth.numerics.arguments import arguments_worded, check_fields, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.detection import Alarm, Decision
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -148,6 +149,7 @@ def _nominal_and_change(
     return theta, size
 
 
+@fields_suggested
 @dataclass(frozen=True)
 class ParameterMonitor:
     """How decisions on parameters are made in every run: the options of `obsynth.decide`.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, real_array, require_kind, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_delays, require_names, whole_record
@@ -24,6 +25,7 @@ class LinearState(NamedTuple):
     z: FloatArray  # ``(nz,)``, before the next sample
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     r"""A realisation from known inputs and outputs to estimates.

@@ -14,6 +14,7 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, require_kind, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepObserver
 from obsynth.plants.dae import DAEModel
@@ -54,6 +55,7 @@ MATRIX_SETTINGS = frozenset(
 )
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class DAESettings(StepObserver):
     """The fields of `obsynth.DAEObserver`, which is these with its steps."""

@@ -22,6 +22,7 @@ from obsynth.numerics.arguments import (
 )
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, rounding_rank
+from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepObserver
 from obsynth.plants.sequences import MatrixSequence
@@ -32,6 +33,7 @@ Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class Adaptation:
     """How parameters are estimated.
@@ -87,6 +89,7 @@ class Adaptation:
                 raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 
+@fields_suggested
 @dataclass(frozen=True, eq=False)
 class RecursiveSettings(StepObserver):
     """The fields of `obsynth.RecursiveObserver`, which is these with its recursion."""

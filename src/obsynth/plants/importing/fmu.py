@@ -12,11 +12,11 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.inputs import path_of
 from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.importing.fmu_description import require_linear_meaning
 from obsynth.plants.importing.fmu_instance import Instance, opened_fmu
 from obsynth.plants.importing.roles import plant_of
-from obsynth.plants.signal_names import suggestion
 
 #: Newton steps towards an equilibrium.
 _EQUILIBRIUM_STEPS = 50

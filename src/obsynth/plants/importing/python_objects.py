@@ -14,11 +14,11 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
+from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES
 from obsynth.plants.importing.roles import plant_of
 from obsynth.plants.importing.transfer_functions import realised
-from obsynth.plants.signal_names import suggestion
 
 #: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
 INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")

@@ -1,0 +1,84 @@
+"""Names that may be meant by a wrong one, and keyword arguments that do not exist."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Any, ParamSpec, TypeVar
+
+#: A name that misses a wrong one by more than this many times the miss of the closest name is not suggested.
+MUCH_FARTHER = 2.5
+
+#: So many letters of a name are taken as its beginning.
+LEAST_BEGINNING = 3
+
+Given = ParamSpec("Given")
+
+Returned = TypeVar("Returned")
+
+Class = TypeVar("Class", bound=type)
+
+#: ``meant(name, known, present)``: a question with the name that is meant, after a blank, or nothing.
+Meant = Callable[[str, Iterable[str], Iterable[str]], str]
+
+
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
+    known = list(names)
+    close = _closest(str(name), known)
+    if not close and len(str(name)) >= LEAST_BEGINNING:
+        close = [other for other in known if other.startswith(str(name))][:3]
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def _closest(name: str, known: Sequence[str]) -> list[str]:
+    """Return at most three names that are close to a wrong one, without those that are much farther than the best."""
+    alike = [other for other in known if other.casefold() == name.casefold()]
+    close = alike or difflib.get_close_matches(name, known, n=3)
+    missed = [1.0 - difflib.SequenceMatcher(None, other, name).ratio() for other in close]
+    return [other for other, miss in zip(close, missed, strict=True) if miss <= MUCH_FARTHER * missed[0]]
+
+
+def keyword_names(function: Callable[..., Any]) -> frozenset[str] | None:
+    """Return the keyword arguments of a function; ``None`` where it takes any."""
+    stated = signature(function).parameters.values()
+    if any(each.kind is Parameter.VAR_KEYWORD for each in stated):
+        return None
+    named = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+    return frozenset(each.name for each in stated if each.kind in named) - {"self"}
+
+
+def require_keywords(
+    given: Iterable[str], known: frozenset[str] | None, function: str, meant: Meant | None = None
+) -> None:
+    """Raise Python's `TypeError` for a keyword argument that is not known, with the name that may be meant."""
+    unknown = None if known is None else next((name for name in given if name not in known), None)
+    if known is not None and unknown is not None:
+        names = sorted(known)
+        near = suggestion(unknown, names) if meant is None else meant(unknown, names, given)
+        raise TypeError(f"{function} has no argument {unknown!r}.{near or _there_are(names)}")
+
+
+def _there_are(names: Sequence[str]) -> str:
+    return f" There are: {', '.join(names)}." if names else " It takes none by name."
+
+
+def keywords_suggested(function: Callable[Given, Returned], meant: Meant | None = None) -> Callable[Given, Returned]:
+    """Return a function, or constructor, that suggests names for keyword arguments which it does not have."""
+    known, of_class = keyword_names(function), function.__name__ == "__init__"
+
+    @wraps(function)
+    def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        if known is not None and not known.issuperset(kwargs):
+            require_keywords(kwargs, known, type(args[0]).__name__ if of_class else function.__name__, meant)
+        return function(*args, **kwargs)
+
+    return called
+
+
+def fields_suggested(cls: Class) -> Class:
+    """Return a class whose constructor suggests names for keyword arguments which it does not have."""
+    cls.__init__ = keywords_suggested(cls.__init__)  # type: ignore[misc]
+    return cls
