@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, eigvals
 
-from obsynth.analysis.existence.wang2015 import fault_filter_conditions
-from obsynth.analysis.zeros import fault_zeros, hidden_faults
+from obsynth.analysis.existence.wang2015 import fault_filter_conditions, known_fault_zeros
+from obsynth.analysis.zeros import fault_zeros, hidden_faults, sampling_zero_warnings
 from obsynth.numerics.invariant_zeros import are_outside, is_outside, zeros_of_system
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
@@ -303,3 +303,16 @@ def test_both_zeros_of_a_pair_are_on_the_same_side(seed):
         assert len(sides) == 3
         assert all(outside == sides[value.conjugate()] for value, outside in sides.items())
         assert sum(sides.values()) == (2 if modulus == 1.0 else 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_warnings_of_zeros_are_those_of_the_zeros_that_existence_knows(seed) -> None:
+    rng = np.random.default_rng([52, seed])
+    E, A, B, C = planted([0.99, 0.985 + 0.02j, 0.3], rng, degree=1)
+    plant = DescriptorSystem(E=E, A=A, C=C, Bf=B, dt=0.1)
+    assert known_fault_zeros(plant) is None
+    assert fault_filter_conditions(plant)[-1].holds
+    zeros = known_fault_zeros(plant)
+    texts = sampling_zero_warnings(plant, zeros)
+    assert len(texts) == 2
+    assert texts == sampling_zero_warnings(plant)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,17 +21,19 @@ from obsynth.plants.signal_names import leading_names
 SLOW_ZERO_RADIUS = 0.98
 
 
-def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
-    """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s."""
+def sampling_zero_warnings(plant: DescriptorSystem, inside: Sequence[complex] | None = None) -> tuple[str, ...]:
+    """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s;
+    ``inside``: the fault zeros inside, where they are known already."""
     if not plant.is_discrete:
         return ()
-    zeros, outside = fault_zeros(plant)
-    inside = [zero.value for zero in zeros if not any(zero is other for other in outside)]
+    if inside is None:
+        zeros, outside = fault_zeros(plant)
+        inside = [zero.value for zero in zeros if not any(zero is other for other in outside)]
     texts = [
         f"Fault zero at {pole_text(value, 6, pair=True)} (modulus {abs(value):.6g}): errors of a fault estimate decay "
         f"there with a time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a "
         "signal nearer to the fault."
-        for value in inside
+        for value in sorted(inside, key=lambda value: (value.real, value.imag))
         if value.imag >= 0.0 and SLOW_ZERO_RADIUS < abs(value) < 1.0
     ]
     return tuple(dict.fromkeys(texts))

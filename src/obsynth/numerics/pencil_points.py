@@ -97,10 +97,11 @@ class PencilPoints:
             return rank_from(values, scale=scale, expected=len(values))
         count = min(MOST_DIRECTIONS, self.E.shape[1])
         # In the basis of the Schur form values are those of the pencil up to the condition of E.
-        least = iterated(self._triangle(point), 1)[0]
+        triangle = self._triangle(point)
+        least = iterated(triangle, 1)[0]
         if least[0] > RANK_TOLERANCE * scale * self._schur[3]:
             return rank_from(least / self._schur[3], scale=scale, expected=1)
-        vectors = self._schur[1] @ iterated(self._triangle(point), count)[1]
+        vectors = self._schur[1] @ iterated(triangle, count)[1]
         basis = np.linalg.qr(vectors)[0]
         values = np.asarray(np.linalg.svd((self.A - point * self.E) @ basis, compute_uv=False))
         return rank_from(values, scale=scale, expected=count)

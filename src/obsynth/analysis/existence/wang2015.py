@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -34,6 +35,9 @@ from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
 from obsynth.plants.transformations.redundant_outputs import merged_outputs
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
+
+#: Conditions in order, the prepared plant on which the last were decided, and the fault zeros where they were reached.
+_Examination: TypeAlias = tuple[tuple[Condition, ...], PreparedPlant | None, tuple[complex, ...] | None]
 
 _fault_zeros = partial(
     Condition,
@@ -149,6 +153,17 @@ def _condition_cache(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ..
     return {}
 
 
+@remembered
+def _fault_zero_cache(_plant: DescriptorSystem) -> dict[bool, tuple[complex, ...]]:
+    """Return the cache of the fault zeros of a plant, decided exactly or not: notes use what existence computed."""
+    return {}
+
+
+def known_fault_zeros(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[complex, ...] | None:
+    """Return the zeros from the faults on which the last condition was decided; ``None`` where it was not."""
+    return _fault_zero_cache(plant).get(exactly)
+
+
 def fault_filter_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
     return _condition_cache(plant).get(exactly) or examine_fault_filter(plant, exactly=exactly)[0]
@@ -164,22 +179,26 @@ def examine_fault_filter(
     if merged is not None and not merged.exact and not result[0][-1].holds:
         # The outputs as written show more than the merged ones, by their rounding: that is unclear, not a refusal.
         result = _decide(dense, exactly)
-    _condition_cache(plant)[exactly] = result[0]
-    return result
+    conditions, prepared, zeros = result
+    _condition_cache(plant)[exactly] = conditions
+    if zeros is not None:
+        _fault_zero_cache(plant)[exactly] = zeros
+    return conditions, prepared
 
 
-def _decide(plant: DescriptorSystem, exactly: bool) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+def _decide(plant: DescriptorSystem, exactly: bool) -> _Examination:
     return reconsidered(Evaluator(plant, exactly), _examined, lambda result: result[0])
 
 
-def _examined(judge: Evaluator) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
-    prepared = list[PreparedPlant]()
-    conditions = up_to_failure(_in_order(judge, prepared))
-    return conditions, prepared[0] if prepared else None
+def _examined(judge: Evaluator) -> _Examination:
+    prepared, zeros = list[PreparedPlant](), list[tuple[complex, ...]]()
+    conditions = up_to_failure(_in_order(judge, prepared, zeros))
+    return conditions, prepared[0] if prepared else None, zeros[0] if zeros else None
 
 
-def _in_order(judge: Evaluator, made: list[PreparedPlant]) -> Iterator[Condition]:
-    """Yield the conditions, each group examined when it is asked for; the prepared plant is appended to ``made``."""
+def _in_order(judge: Evaluator, made: list[PreparedPlant], zeros: list[tuple[complex, ...]]) -> Iterator[Condition]:
+    """Yield the conditions, each group examined when it is asked for; the prepared plant is appended to ``made``, and
+    the fault zeros to ``zeros``."""
     plant = judge.plant
     yield from _form_conditions(judge)
     yield from _rank_conditions(judge)
@@ -189,7 +208,7 @@ def _in_order(judge: Evaluator, made: list[PreparedPlant]) -> Iterator[Condition
     yield from first
     doubt = None if last.holds else index_doubt(judge, prepared.detectability)
     yield last if doubt is None else last.in_doubt(doubt, plant)
-    yield _zero_condition(judge)
+    yield _zero_condition(judge, zeros)
 
 
 def _form_conditions(judge: Evaluator) -> list[Condition]:
@@ -291,10 +310,11 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
     yield judge.full_rank("rank [E; C]", states, unknown, source="Wang 2015, eq. (2)")
 
 
-def _zero_condition(judge: Evaluator) -> Condition:
+def _zero_condition(judge: Evaluator, zeros: list[tuple[complex, ...]]) -> Condition:
     plant = judge.plant
 
     def holding(facts: SystemFacts) -> Condition:
+        zeros.append(facts.zeros)
         largest = max((abs(value) for value in facts.zeros), default=0.0)
         largest_one = f", largest modulus {largest:.6g}" if facts.zeros else ""
         return _fault_zeros(holds=True, value=largest, detail=f"{counted(len(facts.zeros), 'zero')}{largest_one}")

@@ -20,7 +20,7 @@ from obsynth.analysis.existence.detectability_indexes import (
 )
 from obsynth.analysis.existence.restricted_equivalent import prepare, with_sensor_faults_as_states
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
-from obsynth.analysis.zeros import SLOW_ZERO_RADIUS, sampling_zero_warnings
+from obsynth.analysis.zeros import sampling_zero_warnings
 from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
@@ -106,10 +106,10 @@ def notes(
     detectability: FaultDetectability,
     observer: LinearObserver,
     *,
-    largest_zero: float = np.inf,
+    zeros: Sequence[complex] | None = None,
 ) -> tuple[str, ...]:
-    """Return what a user should know; ``largest_zero`` is the largest modulus of a fault zero, where known already."""
-    texts = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
+    """Return what a user should know; ``zeros`` are those from the faults, where they are known to be stable."""
+    texts = list(sampling_zero_warnings(plant, zeros))
     if detectability.condition_number > WARN_DETECTABILITY_CONDITION:
         texts.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "

@@ -26,7 +26,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import Condition, require_all
 from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prepare, with_sensor_faults_as_states
-from obsynth.analysis.existence.wang2015 import examine_fault_filter
+from obsynth.analysis.existence.wang2015 import examine_fault_filter, known_fault_zeros
 from obsynth.conditions.gamma_lower_bound import least_gain_certificate
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.errors import ObsynthError, PreconditionError
@@ -270,7 +270,7 @@ def _synthesised(
         observer,
         Certificate(witnesses, claims),
         {"engine": "lmi" if any("settings" in record for record in records) else "riccati", "runs": records},
-        (*remarks, *notes(plant, prepared.detectability, observer, largest_zero=conditions[-1].value)),
+        (*remarks, *notes(plant, prepared.detectability, observer, zeros=known_fault_zeros(plant))),
     )
 
 
