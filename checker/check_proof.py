@@ -470,11 +470,20 @@ def gain_is_below(system, claim):
     rows, core = system.rows_of_each(claim["rows"]), list(range(first))
     beyond = list(range(first, system.Az.rows))
     require(system.Az.part(core, beyond).is_zero() and system.Cz.part(rows, beyond).is_zero(), "states were left out")
-    require(gamma.number() > 0, "gamma is not positive")
     b, d = system.driven(claim["signal"])
     a, b, c, d = system.Az.part(core, core), b.part(core), -system.Cz.part(rows, core), d.part(rows)
-    p = read_matrix(claim["P"])
-    require(p.rows == first, "P does not fit")
+    require_bounded_real(system, claim, a, b, c, d)
+    return (
+        f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below "
+        f"{shown(gamma.number())}"
+    )
+
+
+def require_bounded_real(system, claim, a, b, c, d):
+    """Prove the bounded real inequality (see ``gain_is_below``) of a system for the gamma and the P of a claim."""
+    gamma, p = read_matrix(claim["gamma"]), read_matrix(claim["P"])
+    require(gamma.number() > 0, "gamma is not positive")
+    require(p.rows == a.rows, "P does not fit")
     require_positive_definite(p, claim["P_positive"], "P")
     level = Matrix.identity(b.columns).times(gamma).times(gamma) - d.T @ d
     if system.discrete:
@@ -484,9 +493,75 @@ def gain_is_below(system, claim):
         corner, side = -(a.T @ p + p @ a + c.T @ c), -(p @ b + c.T @ d)
     whole = Matrix.blocks([[corner, side], [side.T, level]])
     require_positive_definite(whole, claim["bounded_real"], "the bounded real inequality")
+
+
+class Model:
+    """A linear model ``x+ = A x + B s``, ``C x + D s`` (a reference or a weight), all states of which count."""
+
+    def __init__(self, a, b, c, d):
+        n, shapes = a.rows, [(part.rows, part.columns) for part in (a, b, c, d)]
+        require(shapes == [(n, n), (n, d.columns), (d.rows, n), (d.rows, d.columns)], "a model does not fit")
+        self.A, self.B, self.C, self.D = a, b, c, d
+
+    @staticmethod
+    def read(given):
+        """Read a model of the file."""
+        return Model(*(read_matrix(given[name]) for name in "ABCD"))
+
+    def behind(self, first):
+        """Return the model of this one behind another."""
+        require(first.D.rows == self.D.columns, "models that do not fit are put in series")
+        return Model(
+            Matrix.blocks([[first.A, Matrix.zero(first.A.rows, self.A.rows)], [self.B @ first.C, self.A]]),
+            Matrix.blocks([[first.B], [self.B @ first.D]]),
+            Matrix.blocks([[self.D @ first.C, self.C]]),
+            self.D @ first.D,
+        )
+
+
+def matching_is_close(system, claim):
+    """The l2 gain from faults, disturbances and noise, each behind its weight, to a weighted error is below gamma.
+
+    The error of some rows is ``r``, or ``r - M f`` where the faults count: M is a stable reference model of what the
+    rows should be of the faults f.  From rest ``e+ = Az e + B s``, ``r = -Cz e + D s`` (see ``System.driven``), beside
+    the states of M, behind the weight of the signals s and before that of the errors; then as in ``gain_is_below``.
+    The bounded real inequality contains a Lyapunov inequality: reference and weights are stable where it holds.
+    """
+    require(not system.Phi.rows, "the observer follows a fault model: its rows are no estimates from rest")
+    rows, with_faults, with_noise = system.rows_of_each(claim["rows"]), claim["faults"], claim["noise"]
+    require(isinstance(with_faults, bool) and isinstance(with_noise, bool), "whether signals count is true or false")
+    counted = [system.index("disturbances", name) for name in claim["disturbances"]]
+    require(len(set(counted)) == len(counted), "a disturbance counts twice")
+    parts = [system.driven("faults")] * with_faults
+    parts += [tuple(part.part(None, counted) for part in system.driven("disturbances"))]
+    parts += [system.driven("noise")] * with_noise
+    b, d = (Matrix.blocks([list(each)]) for each in zip(*parts, strict=True))
+    error = Model(system.Az, b, -system.Cz.part(rows), d.part(rows))
+    require((claim["reference"] is not None) == with_faults, "faults count from a reference model, and it with faults")
+    if with_faults:
+        reference, others = Model.read(claim["reference"]), b.columns - system.Bf.columns
+        shape = (reference.D.rows, reference.D.columns)
+        require(shape == (len(rows), system.Bf.columns), "the reference model does not fit")
+        error = Model(
+            diagonal(error.A, reference.A),
+            Matrix.blocks([[error.B], [Matrix.blocks([[reference.B, Matrix.zero(reference.A.rows, others)]])]]),
+            Matrix.blocks([[error.C, -reference.C]]),
+            error.D - Matrix.blocks([[reference.D, Matrix.zero(len(rows), others)]]),
+        )
+    weights = claim["input_weight"], claim["error_weight"]
+    if weights[0] is not None:
+        error = error.behind(Model.read(weights[0]))
+    if weights[1] is not None:
+        error = Model.read(weights[1]).behind(error)
+    require(error.D.columns, "no signal counts")
+    require_bounded_real(system, claim, error.A, error.B, error.C, error.D)
+    signals = ["the faults"] * with_faults + claim["disturbances"] + ["the noise"] * with_noise
+    listed = " and ".join(signals) + (", behind the weights of this file," if weights[0] is not None else "")
+    error = "weighted error" if weights[1] is not None else "error"
+    goal = " from the reference model of this file" if with_faults else ""
     return (
-        f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below "
-        f"{shown(gamma.number())}"
+        f"the l2 gain from {listed} to the {error} of the {' and '.join(claim['rows'])} rows{goal} is below "
+        f"{shown(read_matrix(claim['gamma']).number())}"
     )
 
 
@@ -1073,12 +1148,13 @@ def alarm_is_right(system, claim):
 #: What reading a file raises that is not what the format says.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 #: Claims on the error system: they are about the observer's errors only where the identities hold.
-REST_ON_IDENTITIES = ("gain", "deviation", "faults", "fault models")
+REST_ON_IDENTITIES = ("gain", "matching", "deviation", "faults", "fault models")
 CLAIMS = {
     "plant": plant_follows,
     "identities": identities_hold,
     "stable": stable,
     "gain": gain_is_below,
+    "matching": matching_is_close,
     "deviation": deviation_is_below,
     "rounding": rounding_adds_little,
     "faults": faults_are_estimated,

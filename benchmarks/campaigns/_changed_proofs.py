@@ -85,7 +85,7 @@ def _of_claim(
     claim: dict[str, Any], proof: dict[str, Any], az: np.ndarray, dt: float
 ) -> Iterator[tuple[str, Callable[[dict[str, Any]], None]]]:
     kind = claim["claim"]
-    at = [other["claim"] for other in proof["claims"]].index(kind)
+    at = next(place for place, other in enumerate(proof["claims"]) if other is claim)
 
     def change(**values: Any) -> Callable[[dict[str, Any]], None]:
         return lambda file: file["claims"][at].update(copy.deepcopy(values))
@@ -102,6 +102,15 @@ def _of_claim(
     if kind == "gain":
         yield "a gain below the norm", change(gamma=as_data([[0.9999 * _norm(claim, proof, az, dt)]]))
         yield "a P that is zero", change(P=as_data(np.zeros(claim["P"]["size"])))
+    if kind == "matching":
+        norm, gamma = _matching_norm(claim, proof, dt), as_array(claim["gamma"]).item()
+        yield "a gain from a reference below the norm", change(gamma=as_data([[0.9999 * norm]]))
+        if claim["P"]["entries"]:
+            yield "a P of a matching that is zero", change(P=as_data(np.zeros(claim["P"]["size"])))
+        if claim["faults"] and not claim["noise"] and not claim["disturbances"]:
+            yield "another reference model", change(reference=_larger(claim["reference"]))
+        if claim["error_weight"] is not None and gamma < (1.0 + 0.1 * CHANGE) * norm:
+            yield "a larger weight", change(error_weight=_larger(claim["error_weight"]))
     if kind == "deviation":
         yield "smaller deviations", change(deviations=as_data(0.99 * as_array(claim["deviations"])))
     if kind == "faults":
@@ -139,6 +148,44 @@ def _of_claim(
     if kind == "alarm":
         yield "a larger margin", change(margin=as_data(1.1 * as_array(claim["margin"]) + 1e-3))
         yield "other samples", change(y=as_data(0.0 * as_array(claim["y"])), u=as_data(0.0 * as_array(claim["u"])))
+
+
+def _matching_norm(claim: dict[str, Any], proof: dict[str, Any], dt: float) -> float:
+    """Return a lower bound of the norm of a weighted error from a reference model, frequency by frequency."""
+    system = checker().System(proof)
+    counted = [system.index("disturbances", name) for name in claim["disturbances"]]
+    signals = ["faults"] * claim["faults"] + ["disturbances"] * bool(counted) + ["noise"] * claim["noise"]
+    pairs = {signal: [_rounded(part) for part in system.driven(signal)] for signal in signals}
+    if counted:
+        pairs["disturbances"] = [part[:, counted] for part in pairs["disturbances"]]
+    rows = system.rows_of(claim["rows"])
+    b, d = (np.hstack([pair[i] for pair in pairs.values()]) for i in (0, 1))
+    own = _rounded(system.Az), b, -_rounded(system.Cz)[rows], d[rows]
+    models = {name: claim[name] and [as_array(claim[name][letter]) for letter in "ABCD"]
+              for name in ("reference", "input_weight", "error_weight")}  # fmt: skip
+    points = np.exp(1j * np.linspace(0.0, np.pi, 2000)) if dt > 0.0 else 1j * np.r_[0.0, np.geomspace(1e-5, 1e4, 4000)]
+    most = 0.0
+    for point in points:
+        response = _at(own, point)
+        if models["reference"]:
+            response[:, : system.Bf.columns] -= _at(models["reference"], point)
+        if models["input_weight"]:
+            response = response @ _at(models["input_weight"], point)
+        if models["error_weight"]:
+            response = _at(models["error_weight"], point) @ response
+        most = max(most, float(np.linalg.norm(response, 2)))
+    return most
+
+
+def _at(model: Any, point: complex) -> np.ndarray:
+    a, b, c, d = model
+    return np.asarray(c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d)
+
+
+def _larger(model: dict[str, Any]) -> dict[str, Any]:
+    """Return a model whose outputs are larger."""
+    return {name: as_data(as_array(part) * (1.0 + CHANGE * (name in "CD"))) if part["entries"] else part
+            for name, part in model.items()}  # fmt: skip
 
 
 def _norm(claim: dict[str, Any], proof: dict[str, Any], az: np.ndarray, dt: float) -> float:

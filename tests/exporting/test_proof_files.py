@@ -172,21 +172,65 @@ def test_the_gain_of_an_optimal_filter_is_proved_and_no_smaller_one() -> None:
     assert "positive definite" in refused(changed)
 
 
-def test_what_an_optimal_filter_claims_besides_is_named() -> None:
-    """The format has no weights, no reference model and no estimate without delay: what needs these is named."""
-    constant = {name: np.zeros(shape) for name, shape in (("A", (0, 0)), ("B", (0, 1)), ("C", (1, 0)))}
-    cases = {
-        "weights": obsynth.optimal_filter(LOUD, delay=1, weights={"errors": {"f1": 2.0}}),
-        "a reference model": obsynth.optimal_filter(LOUD, reference={**constant, "D": [[0.1]]}, exact=False),
-    }
-    for name, design in cases.items():
-        file = proof_of(design)
-        assert not refused(json.loads(proof_bytes(file))), name
-        assert "gain" not in {claim["claim"] for claim in file["claims"]}, name
-        assert any(text.startswith("the gain ") for text in file["not_covered"]), name
-        assert any("no causal filter has less" in text for text in file["not_covered"])
-    assert "the fault map" in proof_of(cases["a reference model"])["not_covered"]
-    assert "the fault map" not in proof_of(cases["weights"])["not_covered"]
+LAG = {"A": [[0.5]], "B": [[1.0]], "C": [[0.3]], "D": [[1.0]]}
+NOTHING = {name: np.zeros(shape) for name, shape in (("A", (0, 0)), ("B", (0, 1)), ("C", (1, 0)))}
+#: Plants and options of optimal filters with weights or a reference model, and the number of their matching claims.
+MATCHING: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], int]] = {
+    "a weight": (LOUD, {"delay": 1, "weights": {"errors": {"f1": 2.0}}}, 1),
+    "models as weights": (LOUD, {"delay": 1, "weights": {"errors": LAG, "inputs": {"d1": LAG, "w1": 3.0}}}, 1),
+    "decoupled": (LOUD, {"decoupled": ["d1"], "weights": {"errors": {"f1": 2.0}}}, 1),
+    "a share of the fault": (LOUD, {"reference": {**NOTHING, "D": [[0.1]]}, "exact": False}, 1),
+    "a reference": (LOUD, {"reference": {"bandwidth": 2.0}, "exact": False}, 1),
+    "a reference and weights": (
+        LOUD, {"reference": {"bandwidth": 2.0}, "exact": False, "weights": {"errors": LAG, "inputs": {"f1": 0.5}}}, 1,
+    ),
+    "continuous time": (NOISY, {}, 1),
+    "continuous time and weights": (NOISY, {"weights": {"errors": {"f1": 2.0}}}, 2),
+    "continuous time and a reference": (NOISY, {"reference": {"bandwidth": 2.0}, "exact": False}, 1),
+    "the least mean square": (NOISY, {"norm": "h2", "reference": {"bandwidth": 2.0, "order": 2}}, 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MATCHING)
+def test_weights_and_reference_models_of_optimal_filters_are_proved(name: str) -> None:
+    plant, options, count = MATCHING[name]
+    design = obsynth.optimal_filter(plant, **options)
+    file = json.loads(proof_bytes(proof_of(design)))
+    assert not refused(file)
+    claims = [claim for claim in file["claims"] if claim["claim"] == "matching"]
+    assert len(claims) == count
+    assert not [text for text in file["not_covered"] if text.startswith(("the gain ", "the fault map"))]
+    if "gain" in design.certificate.claims and options:
+        gamma = max(float(as_array(claim["gamma"]).item()) for claim in claims)
+        assert design.certificate.claims["gain"] <= gamma <= design.certificate.claims["gain"] * (1.0 + 1e-6)
+    accepted = []
+    for change, make in changes(file):
+        changed = copy.deepcopy(file)
+        make(changed)
+        if not refused(changed):
+            accepted.append(change)
+    assert not accepted
+
+
+def test_a_matching_claim_names_what_counts() -> None:
+    plant, options, _ = MATCHING["a reference"]
+    file = json.loads(proof_bytes(proof_of(obsynth.optimal_filter(plant, **options))))
+    place = next(i for i, claim in enumerate(file["claims"]) if claim["claim"] == "matching")
+    for change, reason in (
+        ({"faults": False}, "reference model"),
+        ({"reference": None}, "reference model"),
+        ({"disturbances": ["d1", "d1"]}, "twice"),
+        ({"disturbances": ["d2"]}, "none of the disturbances"),
+        ({"rows": []}, "no such rows"),
+        ({"noise": 1}, "true or false"),
+        ({"disturbances": []}, "positive definite"),
+        ({"input_weight": {name: as_data(np.eye(1)) for name in "ABCD"}}, "do not fit"),
+    ):
+        changed = copy.deepcopy(file)
+        changed["claims"][place].update(change)
+        assert "matching" in [name for name, proved, _ in program().check(changed)[0] if not proved], reason
+        if reason != "positive definite":
+            assert reason in refused(changed)
 
 
 @pytest.mark.long
