@@ -134,12 +134,20 @@ SYNTAX = [
     Case("tab as indent", whole("schema_version: 1\nplant:\n\tdt: 1\n"), "line 3"),
     Case("two documents", whole("a: 1\n---\nb: 2\n"), "is not valid YAML"),
     Case("another YAML", whole("%YAML 1.1\n---\nschema_version: 1\n"), "%YAML"),
-    Case("duplicate key at the top", text('"name": "case"', '"name": "case", "name": "other"'), 'duplicate key "name"'),
-    Case("duplicate key in the plant", text('"dt": 1.0', '"dt": 1.0, "dt": 2.0'), 'duplicate key "dt" (line'),
-    Case("duplicate key of mappings", text('"options": {}', '"options": {}, "options": {"S": 1}'), '"options" (line'),
+    Case(
+        "duplicate key at the top",
+        text('"name": "case"', '"name": "case", "name": "other"'),
+        'the key "name" is repeated',
+    ),
+    Case("duplicate key in the plant", text('"dt": 1.0', '"dt": 1.0, "dt": 2.0'), 'the key "dt" is repeated'),
+    Case(
+        "duplicate key of mappings",
+        text('"options": {}', '"options": {}, "options": {"S": 1}'),
+        'the key "options" is repeated',
+    ),
     Case("code in a tag", text('"case"', "!!python/object/apply:os.getcwd []"), "could not determine a constructor"),
     Case("value YAML cannot read", text('"case"', "2020-13-45"), "a value that YAML cannot read"),
-    Case("undefined alias", text('"case"', "*nowhere"), "undefined alias"),
+    Case("undefined alias", text('"case"', "*nowhere"), "has no anchor &nowhere"),
     Case("nested too deeply", whole("a: " + "[" * 1000), "nested too deeply"),
 ]
 
@@ -256,7 +264,7 @@ SCHEMA = [
     ),
     Case("tolerance of one", put("method", "options", "tolerance", 1), "method.options.tolerance: must be less than 1"),
     Case("switch as number", put("method", "options", "prove_least", 1), "must be true or false"),
-    Case("S ragged", put("method", "options", "S", [[1, 0], [1]]), "method.options.S: row 2 has 1 entries"),
+    Case("S ragged", put("method", "options", "S", [[1, 0], [1]]), "method.options.S: row 2 has 1 entry"),
     Case("options as list", put("method", "options", [1]), "method.options: must be a mapping"),
 ]
 

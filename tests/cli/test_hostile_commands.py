@@ -376,7 +376,7 @@ def test_ragged_rows_with_an_entry_that_is_none(capsys):
     assert main(["check", "--system", "ragged.yaml"]) == 2
     told = capsys.readouterr().err
     assert "row 1, column 2 must be a number or an expression in k, not nothing (null)" in told
-    assert "row 2 has 1 entries, but row 1 has 2" in told
+    assert "row 2 has 1 entry, but row 1 has 2" in told
 
 
 class TestFoldersOfResults:

@@ -82,7 +82,7 @@ def test_gains_of_another_method_are_named() -> None:
     [
         ("{level: -1}", ["method.options.R.level: must be at least 0, not the number -1. [line 12]"]),
         ("{level: one}", ["method.options.R.level: must be a number, not the text 'one'. [line 12]"]),
-        ("[[1, 2], [3]]", ["method.options.R: row 2 has 1 entries, but row 1 has 2. [line 12]"]),
+        ("[[1, 2], [3]]", ["method.options.R: row 2 has 1 entry, but row 1 has 2. [line 12]"]),
         ("one", ["method.options.R: must be a number, or a list of rows, such as [[1, 0], [0, 1]], or a mapping (key: "
                  "value), not the text 'one'. [line 12]"]),
     ],

@@ -264,7 +264,7 @@ class TestSpec:
             ('"1 / (k + 1)"', "null", "must be a number or an expression in k, not nothing"),
             ('"1 / (k + 1)"', ".nan", "must be a finite number"),
             ('"1 / (k + 1)"', '"1 / (k - 3)"', r"A\(3\) has inf"),
-            ('[0, "1 / (k + 1)"]', '["1 / (k + 1)"]', "row 2 has 1 entries, but row 1 has 2"),
+            ('[0, "1 / (k + 1)"]', '["1 / (k + 1)"]', "row 2 has 1 entry, but row 1 has 2"),
             ("  Phi:", "  Fi:", "plant.Fi: unknown key"),
             ("horizon: 60", "horizon: 0", "must be at least 1"),
             ("dt: 0.5", "dt: 0", "must be greater than 0"),

@@ -63,6 +63,52 @@ MISTAKES = {
         "  C:", "  fault_names: leak\n  C:", "Write fault_names: [leak]", "  fault_names: [leak]\n  C:", 6
     ),
     "tab": Mistake("  A:", "\tA:", "is indented by a tab", "  A:", 5),
+    "empty key": Mistake("name: first", 'name: first\n"": 1', "a key is empty: write its name", "name: first", 3),
+    "empty key of a section": Mistake("  C:", '  "": 1\n  C:', "plant: a key is empty", "  C:", 6),
+    "repeated key": Mistake("dt: 0.1", "dt: 0.1\n  dt: 1", 'the key "dt" is repeated', "dt: 0.1", 5),
+    "open bracket": Mistake(ROWS, "[[0.9, 0.1], [0, 0.8]", "begins in line 5 lacks a comma, or ] at its end", ROWS, 6),
+    "one blank too many": Mistake("  Bf:", "   Bf:", "indent this line by 2 blanks, as line 4", "  Bf:", 7),
+    "no blank after a colon": Mistake("dt: 0.1", "dt:0.1", "Is a blank missing in line 4? Write dt: 0.1", "dt: 0.1", 5),
+    "alias": Mistake("dt: 0.1", "dt: *step", "write the value, or the anchor", "dt: &step 0.1", 4),
+    "second document": Mistake(
+        "  Bf: [[1], [0]]\n", "  Bf: [[1], [0]]\n---\nname: b\n", "put it into a file of its own", TWO[-17:], 8
+    ),
+    "entry that is not known": Mistake("[[0.9,", "[[.nan,", "not nan. Write 0 for no coupling", "[[0,", 5),
+    "decimal comma": Mistake(
+        "[[0.9, 0.1]", "[[0,9, 0,1]", "if commas are decimal ones, write points", "[[0.9, 0.1]", 5
+    ),
+    "brackets": Mistake("C: [[1, 0]]", "C: [[[1, 0]]]", "Remove a pair of brackets", "C: [[1, 0]]", 6),
+    "number in quotes for a version": Mistake(
+        "schema_version: 1", "schema_version: '1'", "Write 1.", "schema_version: 1", 1
+    ),
+    "number for a name": Mistake("name: first", "name: 12", "Write '12', in quotes", "name: '12'", 2),
+    "one level too deep": Mistake(
+        TWO, "  " + TWO.replace("  ", "    ").replace("dt:", "system:\n      dt:", 1), "one level higher", TWO, 4
+    ),
+    "key without a value": Mistake(
+        "name: first", "name: first\nmethod:\n  options:", "Leave options out", "name: first", 4
+    ),
+    "dashes": Mistake(
+        "name: first",
+        "name: first\nmethod:\n  options:\n  - gamma: 2",
+        "Write what is below options without dashes",
+        "name: first\nmethod:\n  id: fault-estimation-filter\n  options:\n    gamma: 2",
+        4,
+    ),
+    "kind of a profile": Mistake(
+        "name: first",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {kind: stp, size: 1}}}",
+        "Did you mean 'step'?",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {kind: step, size: 1}}}",
+        3,
+    ),
+    "profile by another word": Mistake(
+        "name: first",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {type: step, size: 1, begin: 2}}}",
+        "type: unknown key. Did you mean 'kind'?",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {kind: step, size: 1, start: 2}}}",
+        3,
+    ),
 }
 
 

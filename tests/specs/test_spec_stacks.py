@@ -86,7 +86,7 @@ def with_entry(stack: np.ndarray, entry: object) -> list:
         ({"C": C[0].tolist(), "horizon": 9}, "horizon is 9, but the stack A is good for 6 steps only"),
         ({"Q": Q[:-1].tolist()}, "Q is a stack for 5 steps"),
         ({"A": [*A.tolist(), [[1, 0]]]}, "plant.A: matrix 7 of the stack is 1 by 2, but the first is 2 by 2"),
-        ({"A": [*A.tolist(), [[1, 0], [0]]]}, "plant.A: matrix 7 row 2 has 1 entries, but row 1 has 2"),
+        ({"A": [*A.tolist(), [[1, 0], [0]]]}, "plant.A: matrix 7 row 2 has 1 entry, but row 1 has 2"),
         ({"A": with_entry(A, "k")}, "plant.A: matrix 4, row 2, column 1 must be a number, not the text 'k'"),
         ({"A": with_entry(A, True)}, "plant.A: matrix 4, row 2, column 1 must be a number"),
         ({"A": with_entry(A, float("nan"))}, "NaN"),

@@ -1,4 +1,4 @@
-"""Arguments and keys of a plant by the names that books, Simulink and other libraries have for them."""
+"""Arguments and keys of a plant or a profile by the names that books, Simulink and other libraries have for them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,10 @@ OTHER_NAMES = {
     **dict.fromkeys(("outputs", "sensors", "y"), "output_names"),
     **dict.fromkeys(("inputs", "u"), "input_names"),
     **dict.fromkeys(("faults", "f"), "fault_names"),
+    "type": "kind",
+    **dict.fromkeys(("begin", "onset", "from"), "start"),
+    **dict.fromkeys(("stop", "until"), "end"),
+    **dict.fromkeys(("magnitude", "value"), "size"),
 }
 
 

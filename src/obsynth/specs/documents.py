@@ -12,17 +12,22 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
 from obsynth.methods.registry import AUTO, REGISTRY, method_class
-from obsynth.numerics.arguments import field_types, is_whole
+from obsynth.numerics.arguments import field_types, is_number, is_whole
 from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.other_names import name_meant
 from obsynth.specs.lines import composed, line_of
 from obsynth.specs.remedies import (
+    MISSING_KEYS,
     instead_of_list,
+    instead_of_mapping,
     instead_of_matrix,
+    instead_of_nothing,
     instead_of_number,
+    instead_of_section,
     instead_of_time,
     is_matlab,
 )
+from obsynth.specs.syntax_errors import syntax_error
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -52,9 +57,6 @@ _OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
 #: Files that are given for a spec, by their endings.
 _OTHER_LANGUAGES = {".toml": "TOML", ".py": "Python", ".m": "MATLAB", ".ini": "an INI file", ".txt": "a text"}
 
-#: Of a long line so many characters are shown around the place of an error.
-SHOWN_COLUMNS = 100
-
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
     """Return the mapping in a YAML 1.2 document; duplicate keys, tags, anchors set twice, and aliases that
@@ -71,7 +73,7 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
             document = YAML(typ="safe", pure=True).load(text)
         count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:
-        raise SpecError(f"{path} is not valid YAML: {_one_line(error)}{_quoted(error, text)}", path=place) from error
+        raise SpecError(f"{path} is not valid YAML: {syntax_error(error, text)}", path=place) from error
     except RecursionError as error:
         raise SpecError(f"{path} is not a valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
@@ -138,44 +140,6 @@ def described(value: Any) -> str:
     return "a list" if isinstance(value, list) else a_kind(value)
 
 
-def _quoted(error: Exception, text: str) -> str:
-    """Return the line in which the YAML reader stopped, with a caret below the column; nothing where it says none."""
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    lines = text.splitlines()
-    if mark is None or mark.line >= len(lines):
-        return ""
-    number = str(mark.line + 1)
-    line, column = lines[mark.line].expandtabs(1), mark.column
-    start = max(column - SHOWN_COLUMNS // 2, 0) if len(line) > SHOWN_COLUMNS else 0
-    excerpt = line[start : start + SHOWN_COLUMNS]
-    quoted = f"\n  {number} | {excerpt}\n  {' ' * len(number)} | {' ' * (column - start)}^"
-    return quoted + _missing_colon(lines, mark.line)
-
-
-def _missing_colon(lines: Sequence[str], stop: int) -> str:
-    """Return a question about the line before the one at which the YAML reader stopped, where it is a key without a
-    colon."""
-    before = next((i for i in range(stop - 1, -1, -1) if lines[i].partition("#")[0].strip()), None)
-    if before is None:
-        return ""
-    text = lines[before].partition("#")[0].strip()
-    is_key = re.match(r"[A-Za-z_]\w*( |$)", text) and ":" not in text
-    return f"\nIs a colon missing in line {before + 1}: {text!r}?" if is_key else ""
-
-
-def _one_line(error: Exception) -> str:
-    """Return what the YAML reader says about the place and the problem, without the quoted source."""
-    problem = getattr(error, "problem", None) or str(error).strip().splitlines()[0]
-    # The reader adds what it has of the values, which is empty where they are mappings.
-    problem = re.sub(r"\bbut got\b", "but found", str(problem))
-    if "'\\t' that cannot start any token" in problem:
-        problem = "a line is indented by a tab, and YAML takes blanks only: write two blanks instead"
-    problem = re.sub(r"^(found duplicate key .*?) with value .*", r"\1", str(problem), flags=re.DOTALL)
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
-    return f"{str(problem).strip()}{place}."
-
-
 @dataclass(frozen=True)
 class DocumentProblems:
     """Collects path and text of each problem of one document, which is to be a ``what``, to raise them together."""
@@ -214,7 +178,7 @@ class DocumentProblems:
         changed = tree is None or (self.document is not None and self.document != read_yaml(self.source))
         lines = []
         for (path, text), location in list(self.noted.items())[:MAXIMUM_PROBLEMS]:
-            line = None if changed or not path else line_of(tree, location)
+            line = None if changed else line_of(tree, location)
             lines.append((f"{path}: {text}" if path else text) + ("" if line is None else f" [line {line}]"))
         return lines
 
@@ -397,26 +361,25 @@ def _explained(
     in_stack = "<stack>" in item["loc"]
     in_rows = in_stack or "<rows>" in item["loc"]
     key = names[-1] if names else ""
-    if kind == "invalid_key" or "[key]" in location:
+    if kind == "extra_forbidden" and not key:
+        text, names = "a key is empty: write its name, or remove it.", names[:-1]
+    elif kind == "invalid_key" or "[key]" in location:
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "extra_forbidden":
         known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
         beside = _value_at(document, location[:-1])
         beside = list(beside) if isinstance(beside, dict) else []
         meant = name_meant(key, known, beside) or _option_hint(key, prefix, names, known)
-        text = f"unknown key.{meant or _plant_hint(key, prefix, names)}"
+        text = f"unknown key.{meant or _plant_hint(key, prefix, names) or instead_of_section(value, known)}"
     elif kind == "missing":
-        needed = ": give the seconds between samples, or 0 for a plant in continuous time"
-        needed = {"dt": needed, "schema_version": ": write schema_version: 1", "name": ": write name: my-design"}.get(
-            key, ""
-        )
+        needed = f": {MISSING_KEYS[key]}" if key in MISSING_KEYS else ""
         text = f"this key is missing{needed}."
     elif kind in ("ragged_rows", "stack_shapes"):
         text = f"{item['msg']}."
     elif kind == "stated":
         text = item["msg"]
     elif kind == "finite_number":
-        text = f"must be a finite number, not {value}."
+        text = f"must be a finite number, not {value}.{' Write 0 for no coupling.' if in_rows else ''}"
     elif kind == "entry_of_k":
         text = f"{item['msg']}, not {described(value)}."
     elif kind == "time":
@@ -432,23 +395,32 @@ def _explained(
         if kind == "list_of_no_rows":
             actual = "a list of empty rows" if [] in value else "a list of numbers"
         text = f"must be {expected}, not {actual}."
-        text += _remedy(kind, key, value, folder, in_rows=in_rows, is_entry=bool(numbers))
+        text += _remedy(kind, key, value, folder, expected, in_rows=in_rows, is_entry=bool(numbers))
     words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
     place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
     path = ".".join([*([prefix] if prefix else []), *names])
     return path, f"{place} {text}" if place else text, (*filter(None, prefix.split(".")), *location)
 
 
-def _remedy(kind: str, key: str, value: Any, folder: Path, *, in_rows: bool, is_entry: bool) -> str:
+def _remedy(kind: str, key: str, value: Any, folder: Path, expected: str, *, in_rows: bool, is_entry: bool) -> str:
     """Return what to write instead of a value of a wrong kind, as a sentence after a blank; empty where none is known.
 
-    ``in_rows``: the value is a matrix, or with ``is_entry`` a row or an entry of one."""
+    ``expected``: what the value must be; ``in_rows``: it is a matrix, or with ``is_entry`` a row or an entry of one.
+    """
+    if value is None and not is_entry:
+        return instead_of_nothing(key)
     if key == "method":
         return f" Write method: {{id: {value}}}." if isinstance(value, str) else ""
+    if kind == "literal_error":
+        return suggestion(str(value), re.findall(r"'([^']*)'", expected))
+    if kind in ("dict_type", "model_type"):
+        return instead_of_mapping(key, value)
+    if kind == "string_type":
+        return f" Write '{value}', in quotes." if is_number(value) else ""
     if in_rows and not (is_entry and kind == "float_type"):
         return instead_of_matrix(key, value, folder) if not is_entry or is_matlab(value) else ""
-    if kind == "float_type":
-        return instead_of_number(value)
+    if kind in ("float_type", "int_type"):
+        return instead_of_number(value, whole=kind == "int_type")
     return instead_of_list(key, value) if kind == "list_type" else ""
 
 

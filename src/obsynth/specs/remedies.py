@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,51 @@ _PICKS = {
     **dict.fromkeys(("C", "Df", "Dd"), ("outputs", "outputs")),
 }
 
+#: What to write for a key that every document of its kind has.
+MISSING_KEYS = {
+    "A": "write the matrix of the dynamics, such as A: [[0.9, 0.1], [0, 0.8]]",
+    "C": "write the matrix of the outputs, a row for each, such as C: [[1, 0]]",
+    "dt": "give the seconds between samples, or 0 for a plant in continuous time",
+    "horizon": "give the seconds that are simulated, such as horizon: 100",
+    "kind": "write kind: step, or ramp, sine, drift and others",
+    "name": "write name: my-design",
+    "plant": "write plant: and its matrices below, indented",
+    "schema_version": "write schema_version: 1",
+}
+
+#: So many keys of a section are listed in a message.
+MOST_KEYS = 15
+
 #: A matrix with at most this many numbers is written out in a message.
 LARGEST_EXAMPLE = 12
 
 
-def instead_of_number(value: Any) -> str:
+def instead_of_nothing(key: str) -> str:
+    """Return what to write for a key without a value."""
+    return f" {MISSING_KEYS[key][0].upper()}{MISSING_KEYS[key][1:]}." if key in MISSING_KEYS else f" Leave {key} out."
+
+
+def instead_of_mapping(key: str, value: Any) -> str:
+    """Return how a list of mappings, as dashes make one, is written as one mapping."""
+    dashes = isinstance(value, list) and value and all(isinstance(part, dict) for part in value)
+    return f" Write what is below {key} without dashes." if dashes else ""
+
+
+def instead_of_section(value: Any, known: Sequence[str]) -> str:
+    """Return where the keys of a section belong that should not be there, or which keys there are."""
+    if isinstance(value, dict) and value and set(value) <= set(known):
+        return " Write what is below it one level higher, without this key."
+    return f" The keys here are {', '.join(known)}." if 0 < len(known) <= MOST_KEYS else ""
+
+
+def instead_of_number(value: Any, *, whole: bool = False) -> str:
     """Return the number that a text stands for: in quotes, a fraction or formula, with a decimal comma."""
+    if isinstance(value, list):
+        return " Remove a pair of brackets."
     number = number_of(value)
-    return "" if number is None else f" Write {number!r}."
+    if number is None:
+        return ""
+    return f" Write {int(number) if whole and number.is_integer() else number!r}."
 
 
 def number_of(value: Any) -> float | None:

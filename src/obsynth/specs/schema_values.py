@@ -28,6 +28,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
+from obsynth.errors import counted
 from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import (
     Count,
@@ -37,6 +38,7 @@ from obsynth.numerics.arguments import (
     WrittenAs,
     field_types,
     is_number,
+    is_whole,
     problem_with,
 )
 from obsynth.numerics.measurement_units import MICRO_SIGNS
@@ -88,6 +90,15 @@ Time = Annotated[NonNegative, BeforeValidator(in_seconds)]
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
 
 
+def _has_decimal_commas(rows: list[Any]) -> bool:
+    """Whether the longer rows have twice the entries of the shorter ones, whole numbers all: ``0,9`` is two of them.
+    One entry beside two is more likely one that was forgotten."""
+    lengths = sorted({len(row) for row in rows if isinstance(row, list)})
+    if len(lengths) != 2 or lengths[0] < 2 or lengths[1] != 2 * lengths[0]:
+        return False
+    return all(is_whole(entry) for row in rows if isinstance(row, list) and len(row) == lengths[1] for entry in row)
+
+
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
     """Check that rows have one length, besides their entries, so that both kinds of problem are reported; a flat list
     of numbers, and one of empty rows, are one problem each."""
@@ -99,8 +110,14 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
         return check_entries(rows)
     problem = PydanticCustomError(
         "ragged_rows",
-        "row {row} has {found} entries, but row {first} has {expected}",
-        {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
+        "row {row} has {entries}, but row {first} has {expected}{advice}",
+        {
+            "row": ragged[0],
+            "entries": counted(ragged[1], "entry", "entries"),
+            "first": listed[0][0],
+            "expected": listed[0][1],
+            "advice": "; if commas are decimal ones, write points" if _has_decimal_commas(rows) else "",
+        },
     )
     entry_problems: list[InitErrorDetails] = []
     own: Any = get_args(ErrorType)
