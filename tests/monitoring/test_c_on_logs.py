@@ -18,6 +18,7 @@ import pytest
 import obsynth
 from obsynth.exporting.c_source import c_identifier
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_ranges import LearnedRanges
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
 from obsynth.monitoring.thresholds.watched_columns import watched_names
@@ -98,10 +99,14 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     levels = np.linspace(8.0, 20.0, len(statistics.names))
     dt = design.observer.dt or SAMPLE_TIME
     slow = getattr(design.observer, "sensors", None) or {}
+    # Narrower than the logs, so that levels are raised in some of their rows.
+    signals = (*design.plant.input_names, *design.plant.output_names)
+    ends = np.full(len(signals), 0.7)
+    ranges = LearnedRanges(signals, len(design.plant.input_names), -ends, ends, np.zeros(len(signals)))
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
                              seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts,
-                             repeats=np.full(len(design.plant.output_names), 3.0))  # fmt: skip
+                             repeats=np.full(len(design.plant.output_names), 3.0), ranges=ranges)  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

@@ -373,7 +373,9 @@ def _step_text(realisation: Realisation, prefix: str, alarms: Alarms) -> str:
             "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n, _ in taken if n),
             "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in copied_out if n),
             "MONITOR_RESET": "monitor_reset(&s->monitor);" if watched else "",
-            "MONITOR_UNREPEAT": "monitor_unrepeat(&s->monitor, v + U_COUNT);" if watched else "",
+            "MONITOR_UNREPEAT": "monitor_range(&s->monitor, v);\n    monitor_unrepeat(&s->monitor, v + U_COUNT);"
+            if watched
+            else "",
             "MONITOR_STEP": (
                 f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
                 "    shown[SHOWN_COUNT] = s->monitor.statistic;"

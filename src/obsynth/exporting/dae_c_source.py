@@ -141,7 +141,9 @@ def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
             "INPUT": "u" if model.nu else "s->u",
             "MONITOR_RESET": "monitor_reset(&s->monitor);" if watched else "",
             "WAITING_STEP": waiting if watched else "",
-            "MONITOR_UNREPEAT": "monitor_unrepeat(&s->monitor, seen);" if watched else "",
+            "MONITOR_UNREPEAT": "monitor_range(&s->monitor, used);\n    monitor_unrepeat(&s->monitor, seen);"
+            if watched
+            else "",
             "MONITOR_STEP": taking if watched else "",
         },
     )

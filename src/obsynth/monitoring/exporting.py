@@ -83,6 +83,8 @@ class LearnedMonitorInC:
             f"    REAL scores[{max(AGES) * 2 * width}];",
             f"    REAL repeated[{max(self.outputs, 1)}];",
             f"    long equal[{max(self.outputs, 1)}];",
+            f"    REAL raised[{max(AGES)}];",
+            "    REAL raised_now;",
             "    int at, quiet, to_wait;",
             "    long taken;",
             f"}} {prefix}_monitor;",
@@ -105,6 +107,8 @@ class LearnedMonitorInC:
         straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
         rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
         powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
+        nothing = np.zeros(0)
+        middle, half = (nothing, nothing) if learned.ranges is None else learned.ranges.middle_and_half()
         sizes = {
             "CHANNELS": model.channels,
             "ORDER": order,
@@ -117,6 +121,7 @@ class LearnedMonitorInC:
             "MONITOR_WIDTH": max(faults_watched, 1),
             "MONITOR_SETTLING": learned.settling,
             "MONITOR_OUTPUTS": self.outputs,
+            "MONITOR_INPUTS": len(middle),
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
@@ -138,6 +143,8 @@ class LearnedMonitorInC:
             "monitor_centres": learned.centres[None],
             "monitor_scales": learned.scales[None],
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,
+            "monitor_middle": middle[None],
+            "monitor_half": np.where(np.isfinite(half), half, 0.0)[None],
             "monitor_innovation": np.array([[learned.innovation]]),
         }
         faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}

@@ -41,6 +41,9 @@ SHELVED = "shelved: unexplained offset since {}"
 #: Shares of hypotheses below this are not listed.
 LEAST_SHARE = 0.01
 
+#: What heads the inputs that were beyond the range that thresholds were learned from.
+BEYOND_HEADING = "beyond learned range"
+
 #: How a run begins to say that nothing alarmed.
 NO_ALARM = "No alarm"
 
@@ -92,6 +95,8 @@ class AlarmEvent:
         Whether what is named drifts rather than jumped.
     shelved : float, seconds
         Since when there has been an offset that no fault explains, where it has stood for 200 rows; else NaN.
+    beyond : tuple of str
+        Known inputs that were beyond the range that thresholds were learned from, in it or within 200 rows before.
 
     Examples
     --------
@@ -122,6 +127,7 @@ class AlarmEvent:
     ties: tuple[str, ...] = ()
     drifts: bool = False
     shelved: float = math.nan
+    beyond: tuple[str, ...] = ()
 
     @property
     def clear(self) -> bool:
@@ -137,7 +143,8 @@ class AlarmEvent:
     def as_dict(self) -> dict[str, Any]:
         """Return the event as plain data."""
         shares = {name: share for name, share in self.shares if share >= LEAST_SHARE}
-        return {**asdict(self), "shares": shares, "ties": list(self.ties), "interval_valid": self.valid}
+        listed = {"ties": list(self.ties), "beyond": list(self.beyond)}
+        return {**asdict(self), "shares": shares, **listed, "interval_valid": self.valid}
 
 
 class AlarmLog:
@@ -166,9 +173,11 @@ class AlarmLog:
         *,
         distinguished: bool = True,
         ranking: Ranking | None = None,
+        beyond: tuple[str, ...] = (),
     ) -> None:
         """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
-        fault would be named if there was one; ``ranking``: what it may be."""
+        fault would be named if there was one; ``ranking``: what it may be; ``beyond``: inputs that are
+        beyond what was learned."""
         before = self._open.get(by)
         if before is not None and self._place - self._places_of[by] > HOLD:
             self._closed.append(self._open.pop(by))
@@ -203,6 +212,7 @@ class AlarmLog:
             evidence=evidence if largest or before is None else before.evidence,
             distinguished=distinguished or (before is not None and before.distinguished),
             shelved=shelved,
+            beyond=tuple(dict.fromkeys((*(() if before is None else before.beyond), *beyond))),
             **self._ranked(before, ranking, tells=tells),
         )
 
@@ -252,13 +262,15 @@ def alarm_rows(events: Sequence[AlarmEvent], date_of: Callable[[float], str]) ->
     def number(value: float) -> str:
         return "" if math.isnan(value) else f"{value:.4g}"
 
-    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "peak / threshold")]
+    heading = ("alarm by", "from", "to", "rows", "fault", "size", "interval", "peak / threshold", BEYOND_HEADING)
+    rows: list[tuple[str, ...]] = [heading]
     for event in events[:MOST_LISTED_ALARMS]:
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
         interval += " (not valid)" if interval and not event.valid else ""
         ends = date_of(event.start), date_of(event.end)
         fault = fault_text(event, date_of)
-        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
+        peak, beyond = f"{event.evidence:.3g}", ", ".join(event.beyond)
+        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, peak, beyond))
     nonempty = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in nonempty) for row in rows], len(events) - len(rows) + 1
 

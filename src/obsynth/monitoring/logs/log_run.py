@@ -25,6 +25,7 @@ from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
 from obsynth.monitoring.logs.unit_check import UnitCheck
 from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.learned_ranges import RowsBeyond
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
 from obsynth.monitoring.thresholds.watched_columns import as_learned
@@ -164,10 +165,13 @@ class LogRun:
     ) -> None:
         #: Of thresholds that were learned: what leaves out the samples of sensors that may be stuck.
         self.unrepeated: Unrepeated | None = None
+        #: Of these: in which rows inputs and outputs are beyond their learned ranges.
+        self.beyond: RowsBeyond | None = None
         if monitor is not None and isinstance(monitor.rule, LearnedRule):
             learned = monitor.rule.learned
             design = design.replace(observer=as_learned(design.observer, learned))
             self.unrepeated = None if learned.repeats is None else Unrepeated(learned.repeats)
+            self.beyond = None if learned.ranges is None else RowsBeyond(learned.ranges)
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
         self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval)
         self.signals = LogSignals.of(observer, columns, scales, getattr(design.plant, "units", {}))
@@ -353,9 +357,18 @@ class LogRun:
         ]
         if self._levels or self.monitor is not None:
             first = self.rows - len(rows) + 1
+            beyond = self._inputs_beyond(taken, first)
             for number, (row, values, cells) in enumerate(zip(taken, estimates, rows, strict=True), first):
-                cells.extend(self._decided(row, values, number, cells))
+                cells.extend(self._decided(row, values, number, cells, beyond[number - first]))
         return rows
+
+    def _inputs_beyond(self, taken: Sequence[Row], first: int) -> list[tuple[str, ...]]:
+        """Return for rows, of which the first one has this number, which inputs are beyond their learned ranges."""
+        if self.beyond is None:
+            return [()] * len(taken)
+        nothing = np.full(len(self.signals.names), np.nan)
+        read = [nothing if row.deviations is None or row.status in STALE else row.deviations for row in taken]
+        return self.beyond.take(np.array(read), first)
 
     def _outputs_of(self, row: Row) -> FloatArray:
         """Return what was measured of the outputs ``(ny,)``, nothing in a row that is left out."""
@@ -371,8 +384,11 @@ class LogRun:
             self.recovered.take(missed)
         return self.recovered.take(row)
 
-    def _decided(self, row: Row, values: FloatArray, number: int, before: Sequence[Any]) -> list[Any]:
-        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``before``: other cells."""
+    def _decided(
+        self, row: Row, values: FloatArray, number: int, before: Sequence[Any], beyond: tuple[str, ...]
+    ) -> list[Any]:
+        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``before``: other cells;
+        ``beyond``: inputs for which levels are raised."""
         time = row.time
         if row.status in STALE:
             self.events.silent[row.status] += 1
@@ -403,7 +419,7 @@ class LogRun:
                 kind, distinguished = self.monitor.kind, bool(output.fault) or not self.monitor.fault_names
                 self.events.take(
                     kind, output.fault, evidence, time, number, [*before, *cells], distinguished=distinguished,
-                    ranking=output.ranking,
+                    ranking=output.ranking, beyond=beyond,
                 )  # fmt: skip
                 self.alarms.setdefault(self.monitor.kind, time)
                 self.isolated = self.isolated or output.fault
@@ -440,7 +456,8 @@ class LogRun:
         if monitor.rule.bridges and row.bridged:
             deciding = row.status in (*DECIDING, RECOVERING)
         residuals, faults = row.values[self._residuals], row.values[self._faults]
-        return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
+        inputs = None if row.deviations is None else row.deviations[: len(self.observer.input_names)]
+        return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged, inputs)
 
     def _share(self, row: Row, column: int) -> float:
         """Return by how many times a level is higher than stated: as less certain as a fault estimate is."""
@@ -477,6 +494,7 @@ class LogRun:
             "numeric": None if self.stamps is None else sorted(self.stamps.numeric),
             "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
             "repeated": None if self.unrepeated is None else self.unrepeated.memory,
+            "beyond": None if self.beyond is None else self.beyond.memory,
         }
 
     def resume(self, data: dict[str, Any]) -> None:
@@ -487,6 +505,8 @@ class LogRun:
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
         if self.unrepeated is not None:
             self.unrepeated.memory = np.asarray(data["repeated"], dtype=np.float64)
+        if self.beyond is not None and data.get("beyond") is not None:
+            self.beyond.resume(np.asarray(data["beyond"]))
         self.observer.resume(data["observer"])
         self.clock.resume(data["clock"])
         if self.stamps is not None:

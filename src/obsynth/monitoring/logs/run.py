@@ -359,6 +359,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
             *stamps.measured.notes(run.signals.columns_and_signals(), run.signals.inputs),
             *start,
             *stuck_texts(stuck),
+            *(() if run.beyond is None else run.beyond.texts(run.rows)),
         ),
         digest=digest,
         stamps=stamps,

@@ -26,6 +26,10 @@ static void monitor_reset(PREFIX_monitor *m)
         m->repeated[i] = 0;
         m->equal[i] = 0;
     }
+    for (i = 0; i < OLDEST; i++) {
+        m->raised[i] = 1;
+    }
+    m->raised_now = 1;
     m->at = 0;
     m->taken = 0;
     m->to_wait = 0;
@@ -46,6 +50,20 @@ static void monitor_unrepeat(PREFIX_monitor *m, REAL *y)
         m->repeated[i] = y[i];
         if (monitor_longest[i] > 0 && m->equal[i] >= monitor_longest[i]) {
             y[i] = NAN;
+        }
+    }
+}
+
+/* By which factor levels are raised in a row, as an input is beyond the range that was learned. */
+static void monitor_range(PREFIX_monitor *m, const REAL *u)
+{
+    int i;
+    m->raised_now = 1;
+    for (i = 0; i < MONITOR_INPUTS; i++) {
+        REAL away = ABS(u[i] - monitor_middle[0][i]);
+        if (monitor_half[0][i] > 0 && away > monitor_half[0][i]) {
+            REAL share = away / monitor_half[0][i];
+            m->raised_now = share * share > m->raised_now ? share * share : m->raised_now;
         }
     }
 }
@@ -330,6 +348,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     REAL changes[MONITOR_WIDTH];
     REAL ratio, statistic;
     REAL best = -1;
+    REAL raised = 1;
     int changed = -1;
     int which = 0;
     int is_said = 1;
@@ -372,6 +391,8 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     is_said = is_whole || (innovation >= 0 && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
+    m->raised[m->at] = m->raised_now;
+    m->raised_now = 1;
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;
@@ -402,6 +423,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
                 statistic = ratio <= statistic ? statistic : ratio;
             }
         }
+        for (i = 0; i < OLDEST; i++) {
+            raised = m->raised[i] > raised ? m->raised[i] : raised;
+        }
+        statistic /= raised;
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
     }

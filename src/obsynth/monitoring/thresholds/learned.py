@@ -23,6 +23,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
     is_conformal,
     rows_needed,
 )
+from obsynth.monitoring.thresholds.learned_ranges import LearnedRanges
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -115,6 +116,8 @@ class LearnedThresholds:
     drift_limits : mapping of str to float
         Of one log, where no drift is allowed for: by how many deviations of its noise, below one, a slow drift of a
         sensor alarms for as long as it lasts.
+    ranges : LearnedRanges, optional
+        Least and largest values of inputs and outputs in these rows: beyond those of an input levels are raised.
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
@@ -146,6 +149,7 @@ class LearnedThresholds:
     sensor_drift: float = 0.0
     without_drift: tuple[str, ...] = ()
     drift_limits: Mapping[str, float] = field(default_factory=dict)
+    ranges: LearnedRanges | None = None
 
     @property
     def holds(self) -> bool:
@@ -270,6 +274,7 @@ class LearnedThresholds:
             "sensor_drift": self.sensor_drift,
             "without_drift": list(self.without_drift),
             "drift_limits": dict(self.drift_limits),
+            "ranges": None if self.ranges is None else self.ranges.as_dict(),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -407,4 +412,5 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         real_number(data.get("sensor_drift", 0.0), "sensor_drift", "deviations, 0 or more", least=0.0),
         tuple(map(str, data.get("without_drift", ()))),
         {str(name): float(limit) for name, limit in data.get("drift_limits", {}).items()},
+        None if data.get("ranges") is None else LearnedRanges.from_dict(data["ranges"]),
     )

@@ -48,6 +48,7 @@ class LearnedState(NamedTuple):
     before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
     scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
     effects: EffectState = NO_EFFECTS  # of faults and sensors on the residuals
+    raised: FloatArray = NOTHING  # ``(ages,)``: factors of the levels by the inputs of rows, latest last
 
 
 class LearnedRule(Rule):
@@ -85,13 +86,16 @@ class LearnedRule(Rule):
         self._effects = offsets.ravel()
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
+        self._ranges = learned.ranges
 
     def init(self) -> LearnedState:
         """Return the state before the first sample."""
         model = self._model
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
         effects = NO_EFFECTS if self.effects is None else self.effects.init()
-        state = LearnedState(np.tile(model.mean, (model.order, 1)), white, means, effects=effects)
+        state = LearnedState(
+            np.tile(model.mean, (model.order, 1)), white, means, effects=effects, raised=np.ones(max(AGES))
+        )
         if self._walk is None:
             return state
         return state._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
@@ -103,6 +107,7 @@ class LearnedRule(Rule):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
         state = self._scored(state, sample.observation, max(missing, 0))
+        state = state._replace(raised=self._raised(state.raised, sample, max(missing, 0)))
         values_of_row = watched_values(sample.residuals, sample.observation)
         complete = values_of_row is not None and sample.deciding and bool(np.isfinite(values_of_row[self._usual]).all())
         evidence = (
@@ -141,7 +146,8 @@ class LearnedRule(Rule):
             first = [np.sum(state.white[-1] ** 2)]
             changes = self._changes(state, self._bands)
             squares = self._squares(sample.observation)
-            values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
+            values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
+            values = values / (self.learned.levels * state.raised.max())
         values = np.where(np.isnan(values), np.inf, values)
         # Faults are compared without what their slow offsets explain: each has its own.
         fault = (
@@ -162,6 +168,11 @@ class LearnedRule(Rule):
         return state._replace(
             effects=self.effects.step(state.effects, observation, state.white[-1], seen, counts=counts)
         )
+
+    def _raised(self, before: FloatArray, sample: Sample, missing: int) -> FloatArray:
+        """Return the factors of the levels ``(ages,)`` with that of a sample, after so many that are missing."""
+        now = 1.0 if self._ranges is None or sample.inputs is None else self._ranges.raised(sample.inputs)
+        return np.concatenate([before, np.ones(min(missing, max(AGES))), [now]])[-max(AGES) :]
 
     def _scored(self, state: LearnedState, observation: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""

@@ -32,6 +32,7 @@ from obsynth.monitoring.thresholds.learned_from_rows import (
     thresholds_from_rows,
     watched_rows,
 )
+from obsynth.monitoring.thresholds.learned_ranges import ranges_of_rows
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.monitoring.thresholds.normal_notes import (
@@ -193,6 +194,7 @@ def learn_thresholds(
     wanted = [(a + first, a + last) for a, b in logs.ends for first, last in [parsed_rows(rows, b - a)]]
     output = output.of_rows(wanted)
     dt = _sample_time(design, output)
+    known_inputs = len(signals.names) - len(logs.repeats)
     offsets = sensor_deviations(design, signals.deviations(logs.rows)[:, -len(logs.repeats) :])
     drifts = _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift * offsets) if sensor_drift else None
     options: dict[str, Any] = {
@@ -231,6 +233,7 @@ def learn_thresholds(
         drift_limits=_drift_limits(design, lambda: new_run(sizes, starts), logs, offsets, learned)
         if drifts is None and len(logs.ends) == 1
         else {},
+        ranges=ranges_of_rows(signals, signals.deviations(logs.rows[np.unique(output.numbers)]), known_inputs),
     )
 
 

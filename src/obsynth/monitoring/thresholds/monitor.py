@@ -109,6 +109,7 @@ class Sample(NamedTuple):
     deciding: bool = True  # whether a decision may be taken: not in gaps, and not during the warm-up
     skipped: int = 0  # rows that were missing before this one
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
+    inputs: FloatArray | None = None  # ``(nu,)``: known inputs, deviations
 
 
 class RuleOutput(NamedTuple):
