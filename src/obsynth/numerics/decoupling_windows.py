@@ -103,6 +103,7 @@ def estimation_problem(
     reference: Model | None = None,
     exact: bool = True,
     poles: ComplexArray | None = None,
+    brief: bool = False,
 ) -> EstimationProblem:
     """Return the problem of estimation of a plant.
 
@@ -118,6 +119,9 @@ def estimation_problem(
         Whether faults pass exactly by the fault map; otherwise they drive the error beside w (model matching).
     poles : ComplexArray, optional
         Finite poles of the plant, which place the Cayley point; by default all eigenvalues of its pencil.
+    brief : bool, optional
+        Whether a delay that the faults' first responses exclude is refused at once, without the shortest delays: long
+        windows are needed for these, and who tries delays in turn does not read them.
 
     Raises
     ------
@@ -149,6 +153,8 @@ def estimation_problem(
         dead, reference = _without_dead_samples(reference, longest=len(form.A) + len(reference[0]) + 1)
         lags = lags + dead
     lags = lags + form.shift
+    if brief and plant.dt > 0.0 and not _may_show_within(a, c, hidden, selection, lags):
+        raise PreconditionError("Some fault does not show in the outputs within its delay.", condition="delay")
     window = _decoupling_window(a, c, hidden, (bw, dw), selection, lags, plant.dt, form.shift)
     core = _core(a, (bw, dw), window, len(c))
     if reference is not None:
@@ -258,6 +264,19 @@ def _decoupling_window(
             condition="delay",
         )
     return _Window(window.observed, window.Th, stacked(a, c, *noise, window.length), window.G, window.Mf, window.length)
+
+
+def _may_show_within(
+    a: FloatArray, c: FloatArray, hidden: tuple[FloatArray, FloatArray], selection: FloatArray, lags: NDArray[np.int64]
+) -> bool:
+    """Whether the first responses span each fault: these are all that a window of any length has of one sample."""
+    responses = first_responses((a, hidden[0], c, hidden[1]), int(np.max(lags, initial=0)) + 1)
+    for fault, late in zip(selection, lags.tolist(), strict=True):
+        spanning = np.vstack(responses[: late + 1]).T
+        combination = np.linalg.lstsq(spanning, fault, rcond=None)[0]
+        if np.linalg.norm(spanning @ combination - fault) > WINDOW_IDENTITY:
+            return False
+    return True
 
 
 def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:

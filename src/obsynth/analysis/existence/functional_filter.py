@@ -75,7 +75,8 @@ def _fault_conditions(
         return (visible,)
     lost = [point for point in points if not decoupled.shows_at(point)]
     doubtful = [point for point in lost if _may_show(decoupled, point)]
-    shares = {point: _named_columns(plant, decoupled).last_share(point) for point in points}
+    named = _named_columns(plant, decoupled) if points else None
+    shares = {} if named is None else {point: named.last_share(point) for point in points}
     least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
     share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
     follows = Condition(

@@ -189,9 +189,10 @@ def first_problem_or_driven(plant: DescriptorSystem, options: Options) -> tuple[
 def first_problem(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, EstimationProblem]:
     """Return the first fault map that exists, of those that the options leave open, with its problem."""
     last = PreconditionError("No fault map is left open by the options.", condition="fault map")
+    tries_delays = options.reference is None and plant.is_discrete and None in delays_of(options.delay, plant)
     for fault_map in _open_maps(plant, options):
         try:
-            problem = problem_of(plant, fault_map)
+            problem = problem_of(plant, fault_map, brief=tries_delays)
             # A zero far out changes so little of a problem's numbers that the equations take it for rounding.
             if fault_map.exact:
                 require_vanishing(plant, reference=fault_map.reference, delays=fault_map.delays)
@@ -241,22 +242,23 @@ def _power(value: float) -> float:
     return float(2.0 ** np.round(np.log2(value))) if value > 0.0 and np.isfinite(value) else 1.0
 
 
-def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProblem:
-    """Return the problem of estimation of a fault map, in units in which the plant is near one."""
+def problem_of(plant: DescriptorSystem, fault_map: FaultMap, *, brief: bool = False) -> EstimationProblem:
+    """Return the problem of estimation of a fault map, in units in which the plant is near one; with ``brief`` a delay
+    that is clearly too short is refused without saying which would do."""
     plant = fault_map.driven(plant)
     own, units = _units_of(plant)
     channels, each = channels_of(plant, fault_map)
     models = fault_map.setting.models
     poles = None if plant.is_discrete else _finite_poles(plant, channels.E, channels.A)
     if not models:
-        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact, poles=poles)
+        problem = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact, poles=poles, brief=brief)
         weights = (own.faults / units.error)[:, None]
         problem = replace(problem, L=weights * problem.L, D1=weights * problem.D1, F=weights * problem.F)
     else:
         a, b, c, d = reduce(in_series, models)
         scaled = (a, b * each, c / units.error, d * each / units.error)
         problem = estimation_problem(
-            channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact, poles=poles
+            channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact, poles=poles, brief=brief
         )
     driving = np.arange(problem.B.shape[1]) < problem.B.shape[1] - fault_map.undriven
     return replace(problem, B=problem.B * driving, D=problem.D * driving, D1=problem.D1 * driving)
