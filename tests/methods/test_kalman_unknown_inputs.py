@@ -143,3 +143,18 @@ def test_a_known_input_may_be_late_where_an_unknown_one_enters_with_it(seed: int
         x = sampled.A @ x + sampled.B @ u[k] + sampled.Bd @ d[k]
     found = design.observer.run(np.array(outputs), u)
     assert np.max(np.abs(found.states[20:, -1] - np.array(states)[20:, -1])) < 1e-6
+
+
+@pytest.mark.parametrize("multiple", [1 / 7, -3 / 7, 0.2, 0.3])
+def test_noise_along_an_unknown_input_leaves_no_variance_of_rounding(multiple: float) -> None:
+    # In the combination of equations without the unknown input it cancels, but for rounding.
+    hidden = np.array([[0.0], [-1.0], [0.5], [0.25]])
+    process = multiple * hidden + np.array([[0.3], [0.0], [0.0], [0.0]])
+    A = [[0.5, 0.1, 0.0, 0.0], [0.0, 0.4, 0.2, 0.0], [0.1, 0.0, 0.3, 0.0], [0.0, 0.0, 0.1, 0.2]]
+    plant = obsynth.DescriptorSystem(
+        A=A, C=np.eye(4), Bd=hidden, Bw=np.hstack([process, np.zeros((4, 4))]),
+        Dw=np.hstack([np.zeros((4, 1)), 0.1 * np.eye(4)]), dt=1.0,
+    )  # fmt: skip
+    Q = obsynth.descriptor_kalman(plant).observer.Q.at(0)
+    assert np.linalg.matrix_rank(Q) == 1
+    assert np.count_nonzero(np.diag(Q)) == 1

@@ -23,7 +23,7 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, remembered
-from obsynth.numerics.ranks import numerical_rank, product_but_rounding
+from obsynth.numerics.ranks import covariance_factor, numerical_rank, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -56,7 +56,9 @@ class WithoutUnknownInputs:
         matrix = as_matrix(covariance, "Q")
         count = self.equations.shape[1]
         require_shape(matrix.shape, (count, count), "Q")
-        return self.equations @ matrix @ self.equations.T
+        # By a factor: what cancels in a combination of equations has no variance, rather than one of rounding.
+        factor = product_but_rounding(self.equations, covariance_factor(matrix, "Q"))
+        return factor @ factor.T
 
     def initial_state(self, state: object) -> object:
         """Return the mean of the first state: unknown inputs are as likely to be of either sign."""

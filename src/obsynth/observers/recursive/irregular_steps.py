@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.analysis.existence.kalman import without_unknown_inputs
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation
@@ -109,9 +109,8 @@ class IrregularSteps:
             B, Phi = np.split(held, [smooth.nu], axis=1)
             return self.observer.plant.replace(A=transition, B=B, Phi=Phi, dt=seconds), factor @ factor.T
         plant = discretise(smooth, seconds).plant
-        noise = plant.Bw @ plant.Bw.T
         reduced = without_unknown_inputs(plant)
-        return reduced.plant, reduced.equations @ noise @ reduced.equations.T
+        return reduced.plant, as_matrix(reduced.process_covariance(plant.Bw @ plant.Bw.T), "Q")
 
 
 def _over(adaptation: Adaptation | None, share: float) -> Adaptation | None:
