@@ -221,6 +221,9 @@ def corrupted(design: obsynth.ObserverDesign, what: str) -> obsynth.ObserverDesi
         matrices["witness"] = matrices["witness"] + 1e-9 * np.eye(1, matrices["witness"].size, 1).reshape(
             matrices["witness"].shape
         )
+    elif what in ("table", "smaller table"):
+        matrices["trade_off"] = matrices["trade_off"].copy()
+        matrices["trade_off"][:, 1] *= 1.01 if what == "table" else 0.99
     elif what == "radius":
         matrices["multiplier_radius"] = 1e-3 * matrices["multiplier_radius"]
     elif what in ("h", "a gain without a number"):
@@ -237,7 +240,7 @@ CORRUPTED = {
     "threshold": "threshold", "surely_found": "surely found", "delay": "delay", "least": "least",
     "multipliers": "multipliers", "witness": "least", "rounding": "rounding", "one of the witness": "witness",
     "radius": "multipliers", "weights": "weights", "bounds": "threshold", "h": "gains",
-    "a gain without a number": "gains",
+    "a gain without a number": "gains", "table": "table of samples", "smaller table": "table of samples",
 }  # fmt: skip
 
 

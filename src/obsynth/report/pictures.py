@@ -92,7 +92,10 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
     """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
     if len(test.tests) == 1:
         if len(test.trade_off) > 1:
-            text = "The least threshold of all tests against the duration of their samples; the marked one is proved."
+            text = (
+                "The least threshold of all tests against the duration of their samples, by linear programmes; the "
+                "marked one is proved."
+            )
             yield Picture("Least threshold", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
         if test.least > 0.0:
             yield Picture(

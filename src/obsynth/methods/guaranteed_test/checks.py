@@ -50,6 +50,9 @@ BY_PROGRAMME = ("multipliers", "multiplier_radius", "witness", "witness_radius",
 #: Sums in another order differ by less than this share.
 SAME_SUM = 1e-12
 
+#: Shares by which an optimum of the linear programmes may miss the proved bounds: ten times the solver's tolerance.
+TABLE_ROOM = 1e-6
+
 #: Roundings that a product of multipliers and inputs may be away from another.
 PRODUCT_ROUNDINGS = 4.0
 
@@ -88,6 +91,9 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
     yield from _of_the_tests(design, shipped, programmes, tests, constant=constant)
     yield from _of_what_runs(design, shipped, problem, programmes, tests)
     yield from _of_the_least(design, shipped, problem, programmes, used, constant=constant)
+    if constant and not _table_fits(design):
+        claim = "thresholds of other numbers of samples do not contradict the proved ones"
+        yield nothing_wrong("table of samples", claim, ["trade_off"], source="certificate")
     if "mean_threshold" in design.certificate.claims:
         yield _over_tolerances(design, programmes.windows[0], tests[0])
     delay = _delay(programmes.windows[used[0]], tests[used[0]]) * problem.plant.dt
@@ -202,6 +208,25 @@ def excess(proved: NearbySolution | None, radius: FloatArray) -> float:
         return np.nan
     outside = proved.radius > radius
     return float(np.max(proved.radius[outside] / np.maximum(radius[outside], np.finfo(float).tiny), initial=1.0))
+
+
+def _table_fits(design: ObserverDesign) -> bool:
+    """Return whether the thresholds of other numbers of samples do not contradict what is proved of the chosen one.
+
+    More samples never raise the least threshold: it is at most the proved one on as many or more, and at least the
+    proved least on as many or fewer.  The rest of the table is what linear programmes say.
+    """
+    table, claims = design.certificate.matrices.get("trade_off"), design.certificate.claims
+    if table is None:
+        return True
+    samples, threshold = float(design.options["samples"]), float(claims.get("threshold", np.nan))
+    if table.ndim != 2 or table.shape[1] < 2 or not np.any(table[:, 0] == samples):
+        return False
+    long, short = table[table[:, 0] >= samples, 1], table[table[:, 0] <= samples, 1]
+    return bool(
+        np.all(long <= threshold * (1.0 + TABLE_ROOM))
+        and np.all(short >= float(claims.get("least", 0.0)) * (1.0 - TABLE_ROOM))
+    )
 
 
 def _worst(value: float) -> float:

@@ -76,8 +76,10 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     table = test.trade_off[np.isfinite(test.trade_off[:, 1])]
     before = int(test.options["before"]) if test.options["course"] == "step" else 0
     seconds = (table[:, 0] - 1 - before) * test.observer.dt
-    panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
-    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms exists here")
+    panel.plot(
+        seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold, by linear programmes"
+    )
+    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms was found here")
     panel.plot(
         (test.samples - 1 - before) * test.observer.dt,
         test.threshold,
