@@ -44,10 +44,13 @@ STABLE_RADIUS = 1.0 - 1e-6
 SINGULAR_INNOVATION = 1e-11
 #: How much the sizes of what is estimated count beside those of what is measured.
 WANTED_SHARE = 1e-3
+#: Entries below this share of the largest are the rounding of rounding: SciPy balances the pencil of the Riccati
+#: equation, and one of 1e-53 takes the units of states so far apart that no digit of the solution is left.
+NO_ENTRY = float(np.finfo(float).eps) ** 2
 #: How negative a Riccati solution may be, of its size, by rounding.
 NEGATIVE_SHARE = 1e-7
 #: Levels above the least one whose worst noise is returned: nearer ones are closer bounds, until rounding spoils them.
-WORST_LEVELS = (1.0 + 1e-5, 1.0001, 1.001, 1.01)
+WORST_LEVELS = (1.0 + 1e-6, 1.0 + 1e-5, 1.0001, 1.001, 1.01)
 #: What a bound is lowered by, of itself, for the rounding of its sums.
 BOUND_ROUNDING = 1e-9
 #: White noise that passes to the error by less than this share is rounding.
@@ -206,9 +209,14 @@ def _continuous_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Float
 
 
 def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:
+    a, b, q, r, s = (_with_zeros(part) for part in (a, b, q, r, s))
     with warnings.catch_warnings(action="ignore"):
         solution = discrete_riccati(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
     return np.asarray(0.5 * (solution + solution.T))
+
+
+def _with_zeros(matrix: FloatArray) -> FloatArray:
+    return np.where(np.abs(matrix) > NO_ENTRY * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
 def _kalman(problem: EstimationProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
