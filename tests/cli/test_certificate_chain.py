@@ -100,7 +100,7 @@ def test_an_edited_calibration_is_refused(folder: Path, change: str) -> None:
         (("log",), "log.csv", "is damaged: log"),
         (("stands",), None, "is damaged: stands"),
         (("schema_version",), 2, "schema version 2, and this obsynth reads 1"),
-        (("stands",), False, "does not stand: .* 95 % is not its level"),
+        (("stands",), False, "is not valid: .* 95 % is not its level"),
         (("constants", "k", "unit"), "N/m", "'k' is in N m/rad here, and in N/m in box.json"),
     ],
 )

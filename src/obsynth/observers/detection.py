@@ -1,4 +1,4 @@
-"""What a monitor, or a decision on parameters, saw in one record."""
+"""The outcome of a monitor, or of a decision on parameters, over one record: statistic, threshold, first alarm."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from obsynth.numerics.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What a monitor saw in one record.
+    """The outcome of a monitor over one record: its statistic, its threshold, and the first alarm.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Smoothing: the chains of observers, the steps of each again with the way back.
+"""Fixed-interval smoothing: the steps of a recursive observer forward, then their estimates corrected backward.
 
 Constant parameters (form ``forgetting``): states at given parameters, which are estimated from both sides.  Parameters
 that walk are states of the chain.

@@ -10,10 +10,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import freeze
 
 
-def does_not_stand(level: float) -> str:
+def not_valid(level: float) -> str:
     """Return why a calibrated box whose innovations are not white gives no tolerances, and what to do."""
     return (
-        f"The box does not stand: the innovations of the calibration are not white, so {100.0 * level:g} % is not its "
+        f"The box is not valid: the innovations of the calibration are not white, so {100.0 * level:g} % is not its "
         "level. Mend the model or its noise, or state ranges of your own (constants: {name: {nominal, range}})."
     )
 
@@ -36,6 +36,14 @@ class CalibratedBox:
         ``"calibrated"``.
     stands : bool
         Whether the innovations are white: else the level is not that of the box, which a verdict says.
+
+    Examples
+    --------
+    >>> box = CalibratedBox(
+    ...     nominal={"c": 0.5}, low={"c": 0.48}, high={"c": 0.52}, open_sides=(), level=0.95, digest="0" * 64
+    ... )
+    >>> box.low["c"] <= 0.5 <= box.high["c"]
+    True
     """
 
     nominal: Mapping[str, float]
@@ -66,10 +74,10 @@ class CalibratedBox:
         Raises
         ------
         SpecError
-            A side is open: a tolerance without an end bounds nothing.  Or the box does not stand.
+            A side is open: a tolerance without an end bounds nothing.  Or the box is not valid.
         """
         if not self.stands:
-            raise SpecError(does_not_stand(self.level), path="constants")
+            raise SpecError(not_valid(self.level), path="constants")
         if self.open_sides:
             name, side = self.open_sides[0]
             raise SpecError(

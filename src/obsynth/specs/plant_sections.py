@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.plants.calibrated_box import does_not_stand
+from obsynth.plants.calibrated_box import not_valid
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -276,7 +276,7 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
         raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
     calibration = read_calibration(folder / file, where="box.file")
     if not calibration["stands"]:
-        raise SpecError(f"{file}: {does_not_stand(calibration['level'])}", path="box.file")
+        raise SpecError(f"{file}: {not_valid(calibration['level'])}", path="box.file")
     options = {
         "source": "calibrated",
         "level": calibration["level"],

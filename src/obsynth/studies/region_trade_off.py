@@ -41,6 +41,20 @@ class RegionTradeOff:
         Name of the claim.
     designs : tuple of ObserverDesign or str
         The design of each, or why there is none.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.PolytopicSystem(
+    ...     plant={
+    ...         "A": [["0.7 + 0.2 * v", 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]],
+    ...         "dt": 1.0,
+    ...     },
+    ...     scheduling={"v": [-1.0, 1.0]},
+    ... )
+    >>> trade_off = obsynth.region_trade_off(plant, sizes=[0.5, 1.0])
+    >>> trade_off.by, trade_off.values
+    ('size', (0.5, 1.0))
     """
 
     by: str

@@ -61,6 +61,21 @@ class ToleranceStudy:
         Which was studied.
     asked : mapping, optional
         Scenario and options, as plain data.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0},
+    ...     {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    ... )
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=20, inputs={"u1": obsynth.Step(size=1.0)}, faults={"f1": obsynth.Step(size=1.0, start=10)}
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> study = obsynth.tolerance_study(design, scenario, tolerances=(0.0, 0.05), runs=4)
+    >>> study.fault, study.false_alarms.shape
+    ('f1', (2, 2))
     """
 
     tolerances: FloatArray

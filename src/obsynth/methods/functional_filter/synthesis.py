@@ -47,6 +47,8 @@ from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 
+_ModelGain: TypeAlias = tuple[FilterModel, KalmanGain]
+
 #: Errors that need longer than so many times the settling time are mentioned.
 SLOW_ERRORS = 20.0
 
@@ -129,9 +131,6 @@ def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> boo
     except PreconditionError:
         return False
     return True
-
-
-_ModelGain: TypeAlias = tuple[FilterModel, KalmanGain]
 
 
 def _parts(gains: Sequence[_ModelGain], method: FunctionalFilter, *, triangular: bool = False) -> list[FilterPart]:

@@ -1,4 +1,4 @@
-"""Realisation and certificate of the gains of an unknown-input PI observer, found or given."""
+"""Realisation and certificate of the gains of an unknown-input PI observer, computed or given."""
 
 from __future__ import annotations
 

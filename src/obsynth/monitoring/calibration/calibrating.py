@@ -202,12 +202,12 @@ def calibrate(
     ...     constants={"c": 0.4},
     ...     units={"level": "m", "inflow": "m/s", "c": "1/s", "gauge": "m"},
     ... )
-    >>> k, rng = np.arange(200), np.random.default_rng(0)
+    >>> k, rng = np.arange(80), np.random.default_rng(0)
     >>> inflow = 0.5 + 0.2 * np.sign(np.sin(0.1 * k))
     >>> level = [1.0]
     >>> for u in inflow[1:]:
     ...     level.append((level[-1] + u) / (1 + 0.5))  # backward Euler with c = 0.5
-    >>> log = {"time": k, "inflow": inflow, "gauge": np.array(level) + 0.01 * rng.normal(size=200)}
+    >>> log = {"time": k, "inflow": inflow, "gauge": np.array(level) + 0.01 * rng.normal(size=80)}
     >>> calibration = obsynth.calibrate(tank, log, {"c": (0.1, 1.0)})
     >>> round(calibration.nominal["c"], 2)
     0.5

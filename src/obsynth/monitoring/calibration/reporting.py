@@ -248,7 +248,7 @@ def _fitted(
     values = dict(zip((*q, *r), (*Q.values(), *R.values()), strict=True))
     if not box.stands:
         sentences.append(
-            f"The box does not stand: its {100 * box.level:g} % are those of white innovations, which these are not."
+            f"The box is not valid: its {100 * box.level:g} % are those of white innovations, which these are not."
         )
     return sentences + [
         f"The variance of {name} cannot be distinguished from zero: its upper limit {values[name]:.3g} is used."

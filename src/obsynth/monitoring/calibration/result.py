@@ -88,6 +88,27 @@ class Calibration:
         nothing of outputs without any. What is nearer may be the onset of a fault.
     found_offsets : mapping of str to (float, float)
         Offset of each sensor that has one, as it is at the end of the log, and its standard deviation.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * level"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     constants={"c": 0.4},
+    ... )
+    >>> k, rng = np.arange(80), np.random.default_rng(0)
+    >>> inflow = 0.5 + 0.2 * np.sign(np.sin(0.1 * k))
+    >>> level = [1.0]
+    >>> for u in inflow[1:]:
+    ...     level.append((level[-1] + u) / (1 + 0.5))  # backward Euler with c = 0.5
+    >>> log = {"time": k, "inflow": inflow, "gauge": np.array(level) + 0.01 * rng.normal(size=80)}
+    >>> calibration = obsynth.calibrate(tank, log, {"c": (0.1, 1.0)})
+    >>> round(calibration.nominal["c"], 2), calibration.at_bounds
+    (0.5, ())
     """
 
     nominal: Mapping[str, float]
@@ -139,7 +160,7 @@ class Calibration:
         noun = "1 constant" if len(self.nominal) == 1 else f"{len(self.nominal)} constants"
         lines = [
             f"Calibration of {noun} from {self.log['source'] or 'a log'}, {rows} ("
-            f"{100 * self.box.level:g} % box, all at once{'' if self.box.stands else '; it DOES NOT STAND'})"
+            f"{100 * self.box.level:g} % box, all at once{'' if self.box.stands else '; it is not valid'})"
         ]
         if not self.nominal:
             lines = [f"Calibration of the noise from {self.log['source'] or 'a log'}, {rows}"]

@@ -1,8 +1,8 @@
 """Outputs that repeat one value for longer than the log itself makes probable: sensors that are stuck.
 
-What a log has shown is gathered row by row in constant memory, so that streams are told of as files are.  From normal
-logs follows after how many equal samples each sensor says nothing any more (`longest_repeats`), which is decided in the
-row itself, whatever comes later (`Unrepeated`).
+Repeats are counted row by row in constant memory, in streams as in files.  Normal logs decide after how many equal
+samples a sensor counts as stuck (`longest_repeats`); that is then decided in the row itself, whatever comes later
+(`Unrepeated`).
 """
 
 from __future__ import annotations

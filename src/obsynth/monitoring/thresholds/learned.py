@@ -121,6 +121,21 @@ class LearnedThresholds:
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=600, noise=1.0)).outputs
+    >>> normal = pd.DataFrame({"time": range(len(log)), "y1": log[:, 0], "y2": log[:, 1]})
+    >>> learned = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows")
+    >>> learned.every, bool((learned.levels > 0.0).all())
+    (100.0, True)
     """
 
     columns: tuple[str, ...]
@@ -341,7 +356,7 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     ...     sensor_noise={"y1": 0.1, "y2": 0.1},
     ... )
     >>> design = obsynth.fault_estimation_filter(plant)
-    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=2000, noise=1.0)).outputs
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=600, noise=1.0)).outputs
     >>> normal = pd.DataFrame({"time": range(len(log)), "y1": log[:, 0], "y2": log[:, 1]})
     >>> with TemporaryDirectory() as folder:
     ...     _ = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows").save(f"{folder}/t.json")

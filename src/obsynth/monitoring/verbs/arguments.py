@@ -8,9 +8,9 @@ from typing import Any
 from obsynth.monitoring.thresholds.options import DISTURBANCES, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, flag, numbers_of, option, ranges_of
 from obsynth.report.terminal.common_options import (
-    _SCALE,
     INPUT_DELAY,
     MAP,
+    SCALE_OPTION,
     TIME_COLUMN,
     TIME_UNIT,
     TIME_ZONE,
@@ -87,7 +87,7 @@ DATA_OPTIONS = (
                 "monitor 'learned': what obsynth thresholds wrote (.json), or a log without faults",
             ),
             flag("--no-sensor-faults", "monitor 'learned': an alarm is one of the design's faults, and no sensor's"),
-            _SCALE,
+            SCALE_OPTION,
             option(
                 "--threshold",
                 "COLUMN=LEVEL",

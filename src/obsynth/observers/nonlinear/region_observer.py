@@ -72,6 +72,20 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
     ------
     SpecError
         Shapes do not fit together.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "2.0 * der(level) = inflow - 0.5 * sqrt(level) - leak"}, {"gauge": "level"},
+    ...     states={"level": 1.0}, inputs={"inflow": 0.5}, parameters={"leak": 0.0},
+    ... )
+    >>> observer = obsynth.region_observer(
+    ...     tank, region={"level": [0.2, 2.0]}, sample_time=1.0, noise={"gauge": 1e-3, "leak": 1e-4}
+    ... ).observer
+    >>> observer.gain.shape, observer.faults
+    ((2, 1), ('leak',))
+    >>> state, estimates = observer.step(observer.init(), [1.0], [0.5])
     """
 
     model: DAEModel

@@ -91,6 +91,23 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     ------
     SpecError
         Shapes do not fit together.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.PolytopicSystem(
+    ...     plant={
+    ...         "A": [["0.7 + 0.2 * v", 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]],
+    ...         "dt": 1.0,
+    ...     },
+    ...     scheduling={"v": [-1.0, 1.0]},
+    ... )
+    >>> observer = obsynth.design(plant).observer
+    >>> observer.input_names, observer.fault_names
+    (('v',), ('f1',))
+    >>> estimates = observer.run(y=[[0.0, 0.0], [0.1, 0.0]], u=[[0.5], [0.6]])
+    >>> estimates.faults.shape
+    (2, 1)
     """
 
     Az: FloatArray

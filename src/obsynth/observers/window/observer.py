@@ -52,6 +52,15 @@ class WindowObserver(Observer[WindowState, float]):
     ------
     SpecError
         Shapes do not fit together.
+
+    Examples
+    --------
+    >>> mean = WindowObserver(
+    ...     weights=[[0.5, 0.5]], programmes=[0], samples=2, horizon=None, dt=1.0, input_names=(), output_names=("y",),
+    ...     fault_names=(), residual_names=("mean",), fault_delays=(), constants=[0.0],
+    ... )
+    >>> mean.run([[1.0], [3.0], [5.0]]).residuals.ravel()
+    array([nan, nan,  4.])
     """
 
     weights: FloatArray

@@ -53,9 +53,11 @@ CLUSTER = option("--cluster", "ADDRESS", "address of the scheduler of a Dask clu
 
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")
 
-_SCALE = option("--scale", "SIGNAL=FACTOR", "factor from the unit of the column to that of the signal; may be repeated")
+SCALE_OPTION = option(
+    "--scale", "SIGNAL=FACTOR", "factor from the unit of the column to that of the signal; may be repeated"
+)
 
-SCALE = Settings((_SCALE,))
+SCALE = Settings((SCALE_OPTION,))
 
 TIME_COLUMN = option(
     "--time-column",
