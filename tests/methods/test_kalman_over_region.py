@@ -107,10 +107,13 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
     ),
     "faster decay": (lambda d: with_claims(d, region_decay=0.5 * d.certificate.claims["region_decay"]), _DECAY),
     "no number": (lambda d: with_claims(d, region_deviation=float("nan")), _DEVIATION),
-    "another P": (lambda d: with_matrices(d, P_region=0.5 * d.certificate.matrices["P_region"]), _DEVIATION),
+    "another P": (lambda d: with_matrices(d, P_gain=0.5 * d.certificate.matrices["P_gain"]), _DEVIATION),
     "P is not symmetric": (
-        lambda d: with_matrices(d, P_region=d.certificate.matrices["P_region"] + np.array([[0, 1e-9], [0, 0]])),
+        lambda d: with_matrices(d, P_gain=d.certificate.matrices["P_gain"] + np.array([[0, 1e-9], [0, 0]])),
         _DEVIATION,
+    ),
+    "P of the decay is none": (
+        lambda d: with_matrices(d, P_region=0.0 * d.certificate.matrices["P_region"]), "decay over the region",
     ),
     "more noise": (lambda d: d.replace(options={**d.options, "R": [[0.2]]}), _DEVIATION),
     "noise that is none": (lambda d: d.replace(options={**d.options, "R": [[-0.2]]}), "fits the plant"),

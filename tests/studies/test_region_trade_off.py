@@ -17,12 +17,12 @@ _TANK = obsynth.DAEModel(
 
 @pytest.mark.long
 def test_a_larger_region_costs_and_no_course_passes_the_claim() -> None:
-    found = obsynth.region_trade_off(wang(0.3), sizes=[0.1, 0.5, 1.0])
+    found = obsynth.region_trade_off(wang(0.3), sizes=[0.1, 0.5, 1.0], weight="paper")
     assert found.claim == "gamma"
     assert np.all(np.diff(found.claims) > 0)
     assert np.all(found.reached <= found.claims)
     # Each is the design over that region.
-    alone = obsynth.fault_estimation_filter(wang(0.15))
+    alone = obsynth.fault_estimation_filter(wang(0.15), weight="paper")
     assert found.claims[1] == pytest.approx(alone.certificate.claims["gamma"], rel=1e-4)
     table = found.table()
     assert table["size"].tolist() == [0.1, 0.5, 1.0]
@@ -31,7 +31,7 @@ def test_a_larger_region_costs_and_no_course_passes_the_claim() -> None:
 
 
 def test_a_slower_parameter_costs_less_and_any_course_stands_last() -> None:
-    found = obsynth.region_trade_off(wang(0.6, rate=0.05), rates=[0.02, None])
+    found = obsynth.region_trade_off(wang(0.6, rate=0.05), rates=[0.02, None], weight="paper")
     assert found.claims[0] < found.claims[1]
     axes = found.plot()
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0.02", "any"]

@@ -147,7 +147,7 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
     "changed Cz": (lambda d: _nudged(d, "Cz", 1e-3), "unbiased: state"),
     "changed effectiveness": (lambda d: _nudged(d, "effectiveness", 1e-3), "fault estimate"),
     "vertices in another order": (lambda d: with_observer(d, Az=d.observer.Az[::-1]), "unbiased: dynamics"),  # type: ignore[union-attr]
-    "too few rows out": (lambda d: with_observer(d, forgetting=3), "rows without a claim"),
+    "too few rows out": (lambda d: with_observer(d, forgetting=1), "rows without a claim"),
     "other tracking": (
         lambda d: with_matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]),
         "unbiased: state",
@@ -203,16 +203,16 @@ def _log(design: ObserverDesign, samples: int = 200) -> pd.DataFrame:
 
 def test_rows_outside_the_region_are_out_until_the_error_has_decayed(tmp_path: Path, design: ObserverDesign) -> None:
     log, left = _log(design), design.scheduled[1].forgetting
-    log.loc[100, "a"], log.loc[104, "b"] = 1.5, np.nan
+    log.loc[100, "a"], log.loc[102, "b"] = 1.5, np.nan
     obsynth.run_on_data(design, log, out=tmp_path / "estimates.csv")
     found = pd.read_csv(tmp_path / "estimates.csv")
-    assert (found.status[100 : 104 + left] == "out").all()
-    assert found.status[104 + left + 1] == "ok"
+    assert (found.status[100 : 102 + left] == "out").all()
+    assert found.status[102 + left + 1] == "ok"
     assert (found.status[: left - 1] == "warm-up").all()
     assert found.status[99] == "ok"
     good = found.status == "ok"
     truth = np.r_[np.zeros(81), np.ones(119)]
-    assert np.abs(found["fhat[f1]"] - truth)[good].max() < 1e-6
+    assert np.abs(found["fhat[f1]"] - truth)[good].max() < 1e-5
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, design: ObserverDesign) -> None:
@@ -339,3 +339,55 @@ def test_the_least_gain_depends_on_no_coordinates(seed: int) -> None:
     least = obsynth.fault_estimation_filter(plant).certificate.claims["gamma_min"]
     other = obsynth.fault_estimation_filter(PolytopicSystem(moved)).certificate.claims["gamma_min"]
     assert other == pytest.approx(least, rel=1e-3)
+
+
+def _with_rate(plant: PolytopicSystem, rate: float | None) -> PolytopicSystem:
+    return PolytopicSystem(list(plant.vertices), scheduling={"v": {"range": [-1.0, 1.0], "rate": rate}})
+
+
+_DESIGNS: dict[str, Callable[[PolytopicSystem], ObserverDesign]] = {
+    "filter": obsynth.fault_estimation_filter,
+    "kalman": obsynth.descriptor_kalman,
+    "pi": obsynth.ui_pi_observer,
+}
+
+
+def _claims(name: str, plant: PolytopicSystem) -> dict[str, float]:
+    claims = _DESIGNS[name](plant).certificate.claims
+    return {
+        each: claims[each] for each in ("gamma", "region_deviation", "region_gain", "region_decay") if each in claims
+    }
+
+
+def _for(name: str, seed: int) -> PolytopicSystem:
+    """Return a plant for a method, without what the method has no use for."""
+    plant = _random_region(seed)
+    if name == "filter":
+        return plant
+    faults = {"Bf": None, "fault_names": None} if name == "kalman" else {}
+    return PolytopicSystem([v.replace(Bd=None, Dd=None, disturbance_names=None, **faults) for v in plant.vertices])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", _DESIGNS)
+def test_a_rate_makes_no_claim_worse(name: str, seed: int) -> None:
+    """With a rate a decay was one of a coarse grid (.9 where .69 is proved without), and a gain could be larger."""
+    plant = _for(name, seed)
+    plain = _claims(name, _with_rate(plant, None))
+    for rate in (0.1, 1.0):
+        slow = _claims(name, _with_rate(plant, rate))
+        assert slow.keys() == plain.keys()
+        assert all(slow[each] <= plain[each] * (1.0 + 1e-9) for each in plain)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["filter", "kalman"])
+def test_the_order_of_vertices_and_one_twice_change_no_claim(name: str) -> None:
+    """Decays moved by a fifth: they were those of whatever P the solver ended with."""
+    plant = _for(name, 0)
+    first, second = plant.vertices
+    claims = _claims(name, PolytopicSystem([first, second]))
+    for vertices in ([second, first], [first, second, first]):
+        other = _claims(name, PolytopicSystem(vertices))
+        assert [other[each] for each in claims] == pytest.approx(list(claims.values()), rel=2e-3)

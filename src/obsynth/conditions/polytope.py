@@ -49,6 +49,8 @@ from obsynth.verification.error_polytope import ErrorPolytope
 TRACE = 1.0
 #: The largest slack that is sought: more says nothing, and lets the scale of P run away.
 MOST_ROOM = 1.0
+#: The same of a decay, in multiples of an earlier P: no plant in units in which it is near one decays so much faster.
+MOST_DECAY_ROOM = 1e3
 
 
 @arguments_checked
@@ -64,6 +66,7 @@ def vertex_inequalities(
     gains: Sequence[FloatArray] | None = None,
     gain_limit: float | None = None,
     free_output: bool = False,
+    decay_metric: Sequence[FloatArray] | None = None,
     margin: float = MARGIN,
 ) -> Conditions:
     """Return the inequalities at the vertices of an error system, in P and Y.
@@ -92,6 +95,9 @@ def vertex_inequalities(
     free_output : bool, optional
         Whether z may have ``V (C e + D w)`` besides, V a variable, which the innovation gives an estimate at no cost;
         in discrete time, for the gain, with C and D constant.
+    decay_metric : sequence of array_like, optional
+        P of an earlier solution, one or one at each vertex: the slack is then that of the decay alone, in multiples of
+        it, by which the next decay follows (Dinkelbach's iteration).  Needs ``decay``, and ``level`` or goal "decay".
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
@@ -125,7 +131,8 @@ def vertex_inequalities(
         )
     forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains, free_output=free_output)
     room = cp.Variable(name="room") if level is not None or goal == "decay" else None
-    slack = margin if room is None else room
+    slack = margin if room is None or decay_metric is not None else room
+    beside = None if decay_metric is None else _DecaySlack.of(room, decay_metric, decay, errors)
     variables = forms.variables()
     value: Any = None
     if goal != "decay":
@@ -135,11 +142,11 @@ def vertex_inequalities(
             variables[name] = value
     constraints: dict[str, Any] = {}
     for place, now, then in forms.places():
-        constraints |= forms.at(place, now, then, goal, value, decay, slack)
+        constraints |= forms.at(place, now, then, goal, value, decay, slack, beside)
     constraints |= {f"P{name}": lmi.at_least(P, slack) for name, P in forms.positive()}
     if room is not None:
         variables["room"] = room
-        constraints["room"] = room <= MOST_ROOM
+        constraints["room"] = room <= (MOST_ROOM if beside is None else MOST_DECAY_ROOM)
     if goal == "decay":
         constraints["trace"] = sum(cp.trace(P) for _, P in forms.positive()) <= TRACE * errors.order
     if gain_limit is not None and gains is None:
@@ -281,8 +288,9 @@ class _Forms:
         return [(f"[{i + 1}]", now, then) for i, (now, then) in enumerate(self.pairs)]
 
     def at(
-        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, slack: Any
-    ) -> dict[str, Any]:
+        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, slack: Any,
+        beside: _DecaySlack | None,
+    ) -> dict[str, Any]:  # fmt: skip
         """Return the inequalities at weights, by name."""
         errors = self.errors
         G = _mean(self.G, now)
@@ -293,12 +301,14 @@ class _Forms:
             Z, Dz = Z + self.V @ errors.C[0], Dz + self.V @ errors.D[0]
         if errors.dt > 0.0:
             low = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
-            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, slack)
-        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, slack)
+            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, slack,
+                                  0.0 if beside is None else beside.at(now))  # fmt: skip
+        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, slack,
+                                0.0 if beside is None else beside.at(now))  # fmt: skip
 
     def _discrete(
         self, place: str, P: Any, low: Any, G: Any, GA: Any, GB: Any, Z: Any, Dz: Any,
-        goal: str, value: Any, decay: float | None, slack: Any,
+        goal: str, value: Any, decay: float | None, slack: Any, beside: Any,
     ) -> dict[str, Any]:  # fmt: skip
         n, p, q = P.shape[0], Dz.shape[1], Dz.shape[0]
         remainder = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
@@ -317,7 +327,7 @@ class _Forms:
             constraints[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + slack <= value
             constraints[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB, low]]), 0.0)
         if decay is not None:
-            lower = [[decay**2 * P - remainder], [GA, low]]
+            lower = [[decay**2 * P - remainder - beside], [GA, low]]
             constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 1)), slack)
         return constraints
 
@@ -340,6 +350,7 @@ class _Forms:
         value: Any,
         decay: float | None,
         slack: Any,
+        beside: Any,
     ) -> dict[str, Any]:
         n, p = P.shape[0], Dz.shape[1]
         rest = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
@@ -354,7 +365,7 @@ class _Forms:
             k = self.errors.differential or P.shape[0]
             constraints[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
         if decay is not None:
-            lower = [[-2.0 * GA - 2.0 * decay * P - rest]]
+            lower = [[-2.0 * GA - 2.0 * decay * P - rest - 2.0 * beside]]
             constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -P, 0)), slack)
         return constraints
 
@@ -386,6 +397,24 @@ class _Forms:
 
     def _multiplier(self, values: Values) -> dict[str, FloatArray]:
         return {"t": np.atleast_2d(values["t"])} if self.t is not None else {}
+
+
+@dataclass(frozen=True, eq=False)
+class _DecaySlack:
+    """The slack of a decay in multiples of an earlier P."""
+
+    room: Any
+    metric: list[FloatArray]  # at each vertex
+
+    @classmethod
+    def of(cls, room: Any, metric: Sequence[FloatArray], decay: float | None, errors: ErrorPolytope) -> _DecaySlack:
+        if room is None or decay is None:
+            raise SpecError("A metric of the decay needs decay, and level or goal 'decay'.", path="decay_metric")
+        each = [np.asarray(matrix, np.float64) for matrix in metric]
+        return cls(room, each * (errors.count if len(each) == 1 else 1))
+
+    def at(self, weights: FloatArray) -> Any:
+        return self.room * _mean(self.metric, weights)
 
 
 def descriptor_variables(n: int, k: int) -> tuple[Any, Any]:

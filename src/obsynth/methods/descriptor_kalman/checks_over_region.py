@@ -23,6 +23,7 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Residual, equality
 from obsynth.verification.over_region import (
     FROZEN_ROW,
+    GAIN_WITNESSES,
     WITNESSES,
     courses,
     decay_row,
@@ -117,16 +118,17 @@ def _proved_rows(
     noise: NoiseOverRegion,
 ) -> Iterator[Check]:
     claims, matrices = design.certificate.claims, design.certificate.matrices
-    steps = plant.scheduling.step_of(plant.dt) if WITNESSES[1] in matrices else None
+    slack = WITNESSES[1] in matrices or GAIN_WITNESSES[1] in matrices
+    steps = plant.scheduling.step_of(plant.dt) if slack else None
     words = courses(plant.scheduling, steps)
-    witness = witness_of_certificate(matrices, None if steps is None else pairs_of(plant.count, steps))
+    pairs = None if steps is None else pairs_of(plant.count, steps)
     vertices = _vertices(observer, tracking, noise)
     level = claimed(claims, "region_deviation")
     yield deviation_row(
         "mean square over the region: the root of the mean square of all state errors together is below this, in the "
         f"end, for the stated white noise, {words}, whatever they are that does not depend on the noise",
         vertices,
-        witness,
+        witness_of_certificate(matrices, pairs, GAIN_WITNESSES),
         level,
         discrete=True,
     )
@@ -139,7 +141,7 @@ def _proved_rows(
         detail=f"{at_rest / level:.3f} of what is proved" if level > 0.0 else "",
     )
     decay = claimed(claims, "region_decay")
-    yield decay_row(vertices, witness, decay, discrete=True, words=words)
+    yield decay_row(vertices, witness_of_certificate(matrices, pairs), decay, discrete=True, words=words)
     yield forgetting_row(decay, observer.forgetting, discrete=True)
 
 

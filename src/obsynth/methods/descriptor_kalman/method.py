@@ -16,7 +16,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.over_region import DECAY_ROW, DEVIATION_ROW, WITNESSES
+from obsynth.verification.over_region import DECAY_ROW, DEVIATION_ROW, GAIN_WITNESSES, WITNESSES
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class DescriptorKalman(Method):
         ),
         "region_decay": ClaimMeaning("", "factor a sample by which errors shrink over a region", DECAY_ROW),
     }
-    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", *WITNESSES})
+    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", *WITNESSES, *GAIN_WITNESSES})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"state despite noise"})
 
     Q: Annotated[Any, WrittenAs("varying covariance")] = None

@@ -14,6 +14,7 @@ the same P its mean square is at most that of the first, as ``M'PM + I < P``.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from obsynth.analysis.existence.kalman_over_region import free_equations, kalman
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
 from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
-from obsynth.methods.engines.vertex_certificates import certified, proved_decay
+from obsynth.methods.engines.vertex_certificates import VertexCertificate, analysed, certified
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.recursive.steady_filter import steady_state_filter
@@ -32,7 +33,7 @@ from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
-from obsynth.verification.over_region import rows_to_forget, stored_witness
+from obsynth.verification.over_region import GAIN_WITNESSES, rows_to_forget, stored_witness
 
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
@@ -64,24 +65,53 @@ def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: 
     sizes = _sizes(plant, noise)
     T, N = _constant_gains(plant, noise, sizes)
     errors = _errors(plant, noise, T, N)
-    lyapunov = "common" if steps is None else "vertex"
-    weighted = _with_outputs(errors, 1.0 / sizes)
-    certificate = certified(weighted, goal="power", margin=MARGIN, lyapunov=lyapunov, steps=steps)
+    certificate, claim = _certified(errors, sizes, steps)
     gains = certificate.gains * (plant.count if len(certificate.gains) == 1 else 1)
+    decay = certificate.decay
+    used = claim.witness.G is not None or certificate.witness.G is not None
     progress("building the realisation and its certificate")
-    claim = certified(errors, goal="power", gains=gains, lyapunov=lyapunov, steps=steps)
-    decay = proved_decay(errors, gains, claim.witness)
     letters = {"L": T, "K": N} | {f"S[{i + 1}]": S for i, S in enumerate(gains)}
     return Synthesis(
         options={**method.as_plain(), **noise.stated()},
         gains=letters,
         observer=_observer(plant, T, N, gains, decay),
         certificate=Certificate(
-            {"tracking": T, **stored_witness(claim.witness)}, {"region_deviation": claim.level, "region_decay": decay}
+            {
+                "tracking": T,
+                **stored_witness(certificate.witness),
+                **stored_witness(claim.witness, GAIN_WITNESSES),
+            },
+            {"region_deviation": claim.level, "region_decay": decay},
         ),
         solver={"engine": "lmi", "runs": [*certificate.runs, *claim.runs]},
-        notes=_notes(plant, decay, steps, noise),
+        notes=_notes(plant, decay, steps if used else None, noise),
     )
+
+
+def _certified(
+    errors: ErrorPolytope, sizes: FloatArray, steps: float | None
+) -> tuple[VertexCertificate, VertexCertificate]:
+    """Return gains with their decay, and the claim of their deviation: for small steps where that is the lower one."""
+    weighted = _with_outputs(errors, 1.0 / sizes)
+
+    def claimed(made: VertexCertificate) -> VertexCertificate:
+        return analysed(errors, made.gains, steps=steps, goal="power")
+
+    try:
+        common = certified(weighted, goal="power", margin=MARGIN)
+    except SolverError:
+        if steps is None:
+            raise
+        slow = certified(weighted, goal="power", margin=MARGIN, lyapunov="vertex", steps=steps)
+        return slow, claimed(slow)
+    claim = claimed(common)
+    if steps is None:
+        return common, claim
+    with suppress(SolverError):
+        slow = certified(weighted, goal="power", margin=MARGIN, decay=common.decay, lyapunov="vertex", steps=steps)
+        better = claimed(slow)
+        return (slow, better) if better.level < claim.level else (common, claim)
+    return common, claim
 
 
 def _constant_gains(plant: PolytopicSystem, noise: NoiseOverRegion, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -109,7 +139,9 @@ def _constant_gains(plant: PolytopicSystem, noise: NoiseOverRegion, sizes: Float
 
     for places in (range(plant.count), ()):
         try:
-            certificate = certified(_with_outputs(problem(places), 1.0 / sizes), goal="power", gain="constant")
+            certificate = certified(
+                _with_outputs(problem(places), 1.0 / sizes), goal="power", gain="constant", fast_decay=False
+            )
         except SolverError:
             continue
         return L0 + certificate.gains[0] @ N1, K0 + certificate.gains[0] @ N2

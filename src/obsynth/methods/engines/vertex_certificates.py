@@ -16,6 +16,7 @@ import numpy as np
 from obsynth.conditions.lmi import USABLE_STATUSES
 from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
+from obsynth.methods.engines.fastest_decay import faster, fastest_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
 from obsynth.numerics.ranks import decide_rank
@@ -36,6 +37,8 @@ MOST_RESCALINGS = 4
 #: Shares of what errors are about that count as no gain at all: where errors can be decoupled, the least level is zero
 #: but for rounding, and the first of these that is proved is shipped.
 NEGLIGIBLE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+#: Shares of the distance to one by which a decay is slower than the fastest at a level, whose P proves nothing.
+DECAY_MARGINS = (0.02, 0.1, 0.3)
 #: Steps by which a decay that is not proved is made slower, towards none.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
 #: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
@@ -95,6 +98,7 @@ def certified(
     gain: str = "scheduled",
     gains: Sequence[FloatArray] | None = None,
     free_output: bool = False,
+    fast_decay: bool = True,
     solver: str = "CLARABEL",
     settings: Mapping[str, Any] | None = None,
 ) -> VertexCertificate:
@@ -112,6 +116,9 @@ def certified(
         Relative distance to the least level.
     decay, lyapunov, steps, gain, gains, free_output : optional
         As for `obsynth.conditions.vertex_inequalities`.
+    fast_decay : bool, optional
+        Whether gains that are sought in discrete time, without ``decay``, shall have about the fastest decay that the
+        level allows.
     solver : str, optional
         Any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
     settings : mapping, optional
@@ -122,38 +129,25 @@ def certified(
     SolverError
         No certificate was found.  That proves nothing: there may be one.
     """
-    # A little more decay than asked for: what a solver leaves of its constraints is off by its tolerances.
-    target_decay = None if decay is None else decay * (1.0 - DECAY_ROOM if errors.dt > 0.0 else 1.0 + DECAY_ROOM)
-    options: dict[str, Any] = {"goal": goal, "decay": target_decay, "lyapunov": lyapunov, "steps": steps, "gain": gain}
-    options |= {"free_output": True} if free_output else {}
-    units = ErrorUnits.of(errors)
-    runs: list[dict[str, Any]] = []
-    prover = prove_gain if goal == "gain" else prove_mean_square
-    more = {"ball": errors.ball} if goal == "gain" else {}
-    least, z_unit, size = _least(units, options, gains, solver, settings, runs)
+    search = _Search(
+        errors,
+        ErrorUnits.of(errors),
+        {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain}
+        | ({"free_output": True} if free_output else {}),
+        gains,
+        solver,
+        settings,
+        [],
+    )
+    least, z_unit, size = _least(search.units, search.options_with(decay), gains, solver, settings, search.runs)
     levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS + WIDE_ROOMS]
     if level is None and least < NEGLIGIBLE[0] * size:
         levels = [share * size for share in NEGLIGIBLE]
     for target in dict.fromkeys(levels):
         z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else power_of_two(target)
-        moved = units.moved(z_unit)
-        problem = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
-        if not has_numbers(problem, solver, settings, runs):
-            continue
-        inner, own = witness_of(moved, problem, steps=steps)
-        candidates = [own]
-        if goal == "gain" and gains is None and _one_gain_is_enough(moved):
-            # The solver's own only where a decay needs more than the best one for the gain.
-            candidates = [[_best_gain(moved, inner.P[0], target / z_unit)], own]
-        witness = units.witness_out(inner, z_unit)
-        V = problem.variables["V"].value * z_unit / units.outputs if free_output else None
-        whole = errors if V is None else errors.with_innovation(V)
-        for each in candidates:
-            made = [units.gain_out(L) for L in each] if gains is None else [np.asarray(L, np.float64) for L in gains]
-            proof = prover(whole.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
-            rate = proved_decay(errors, made, witness, required=decay) if proof.proved else None
-            if rate is not None and (decay is None or (rate <= decay if errors.dt > 0.0 else rate >= decay)):
-                return VertexCertificate(made, witness, target, least, rate, proof, tuple(runs), V)
+        made = search.at(target, z_unit, decay, least)
+        if made is not None:
+            return _with_fast_decay(search, made, z_unit) if fast_decay and decay is None else made
     if level is not None and level < least:
         raise SolverError(
             f"No observer with one certificate over the region was found at {level:.6g}: the least level found for "
@@ -163,6 +157,158 @@ def certified(
         "A gain was found, but no certificate at the vertices could be proved. That is no proof that there is none: "
         "give a smaller region, or a larger margin.",
     )
+
+
+def certified_for_steps(
+    errors: ErrorPolytope, *, steps: float | None, decay: float | None = None, **options: Any
+) -> VertexCertificate:
+    """Return a certificate for small steps of the weights where that proves a lower level, else one for every course.
+
+    Neither level nor decay is worse than without the steps: these are those of one P, which is a P at each vertex too.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        The vertices; with inputs w.
+    steps : float or None
+        As for `certified`.
+    decay : float, optional
+        As for `certified`.
+    **options
+        The others of `certified`, but ``lyapunov``.
+
+    Raises
+    ------
+    SolverError
+        No certificate was found.
+    """
+    if steps is None:
+        return certified(errors, decay=decay, **options)
+    try:
+        common = certified(errors, decay=decay, **options)
+    except SolverError:  # no P serves all vertices
+        return certified(errors, decay=decay, lyapunov="vertex", steps=steps, **options)
+    try:
+        slow = certified(errors, decay=common.decay, lyapunov="vertex", steps=steps, **options)
+    except SolverError:
+        return common
+    return slow if slow.level < common.level else common
+
+
+def analysed(
+    errors: ErrorPolytope, gains: Sequence[FloatArray], *, steps: float | None, **options: Any
+) -> VertexCertificate:
+    """Return the lowest level that is proved of given gains: for every course, or for small steps of the weights.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        The vertices; with inputs w.
+    gains : sequence of FloatArray
+        One, or one at each vertex.
+    steps : float or None
+        As for `certified`.
+    **options
+        The others of `certified`, but ``lyapunov``.
+
+    Raises
+    ------
+    SolverError
+        No certificate was found.
+    """
+    courses: list[dict[str, Any]] = [{}] if steps is None else [{}, {"lyapunov": "vertex", "steps": steps}]
+    made, failures = [], []
+    for course in courses:
+        try:
+            made.append(certified(errors, gains=gains, **course, **options))
+        except SolverError as error:
+            failures.append(error)
+    if not made:
+        raise failures[-1]
+    return min(made, key=lambda each: each.level)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """An error system with the options under which a certificate is sought."""
+
+    errors: ErrorPolytope
+    units: ErrorUnits
+    options: dict[str, Any]
+    gains: Sequence[FloatArray] | None
+    solver: str
+    settings: Mapping[str, Any] | None
+    runs: list[dict[str, Any]]
+
+    def options_with(self, decay: float | None) -> dict[str, Any]:
+        """Return the options with a little more decay: what a solver leaves of its constraints is off by its
+        tolerances."""
+        if decay is None:
+            return self.options
+        room = min(decay, abs(1.0 - decay)) if self.errors.dt > 0.0 else -decay
+        return {**self.options, "decay": decay - DECAY_ROOM * room}
+
+    def at(self, level: float, z_unit: float, decay: float | None, least: float) -> VertexCertificate | None:
+        """Return gains with the largest slack at a level, and their certificate if it is proved."""
+        errors, units, gains, steps = self.errors, self.units, self.gains, self.options["steps"]
+        moved = units.moved(z_unit)
+        problem = vertex_inequalities(
+            moved, level=level / z_unit, gains=units.gains_in(gains), **self.options_with(decay)
+        )
+        if not has_numbers(problem, self.solver, self.settings, self.runs):
+            return None
+        inner, own = witness_of(moved, problem, steps=steps)
+        candidates = [own]
+        if self.options["goal"] == "gain" and gains is None and _one_gain_is_enough(moved):
+            # The solver's own only where a decay needs more than the best one for the gain.
+            candidates = [[_best_gain(moved, inner.P[0], level / z_unit)], own]
+        witness = units.witness_out(inner, z_unit)
+        V = problem.variables["V"].value * z_unit / units.outputs if "V" in problem.variables else None
+        whole = errors if V is None else errors.with_innovation(V)
+        for each in candidates:
+            made = [units.gain_out(L) for L in each] if gains is None else [np.asarray(L, np.float64) for L in gains]
+            proof = self._proof(whole, made, witness, level)
+            rate = proved_decay(errors, made, witness, required=decay) if proof.proved else None
+            if rate is not None and (decay is None or (rate <= decay if errors.dt > 0.0 else rate >= decay)):
+                return VertexCertificate(made, witness, level, least, rate, proof, tuple(self.runs), V)
+        return None
+
+    def _proof(self, whole: ErrorPolytope, gains: list[FloatArray], witness: Witness, level: float) -> VertexProof:
+        vertices, discrete = whole.closed(gains), whole.dt > 0.0
+        if self.options["goal"] == "gain":
+            return prove_gain(vertices, witness, level, discrete=discrete, ball=whole.ball)
+        return prove_mean_square(vertices, witness, level, discrete=discrete)
+
+
+def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -> VertexCertificate:
+    """Return gains of the same level with about the fastest decay that they may have, in discrete time.
+
+    That decay is a number of the plant, whatever its coordinates; the one that comes with the largest slack is not.
+    """
+    errors, units = search.errors, search.units
+    if errors.dt <= 0.0 or search.gains is not None or errors.ball:
+        return first
+    moved, steps, s = units.moved(z_unit), search.options["steps"], units.states / z_unit
+    start = fastest_of(errors, first.gains, first.witness)
+    if start is None:
+        return first
+
+    def solved(rate: float, metric: list[FloatArray]) -> tuple[float, list[FloatArray]] | None:
+        problem = vertex_inequalities(
+            moved, level=first.level / z_unit, decay=rate, decay_metric=metric, **search.options
+        )
+        if not has_numbers(problem, search.solver, search.settings, search.runs):
+            return None
+        witness, gains = witness_of(moved, problem, steps=steps)
+        reached = fastest_of(moved, gains, witness)
+        return None if reached is None else (reached, list(witness.P))
+
+    fastest, _ = faster(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)
+    for margin in DECAY_MARGINS:
+        made = search.at(first.level, z_unit, fastest + margin * (1.0 - fastest), first.least)
+        if made is not None:
+            return made
+    return replace(first, runs=tuple(search.runs))
 
 
 def _remedy(errors: ErrorPolytope) -> str:
@@ -264,7 +410,10 @@ def proved_decay(
 ) -> float:
     """Return a decay that a given certificate proves: ``required`` where it does, else near the fastest it can."""
     vertices, discrete = errors.closed(gains), errors.dt > 0.0
-    fastest = _decay_of(errors, gains, witness)
+    fastest = fastest_of(errors, gains, witness)
+    if fastest is None:
+        fastest = 0.0
+    fastest = min(fastest, 1.0) if discrete else fastest
     tries = [] if required is None else [required]
     if discrete:
         tries += [fastest + share * (1.0 - fastest) for share in DECAY_SHARES]
@@ -274,21 +423,6 @@ def proved_decay(
         if prove_decay(vertices, witness, rate, discrete=discrete, ball=errors.ball).proved:
             return rate
     return 1.0 if discrete else 0.0
-
-
-def _decay_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness) -> float:
-    """Return the decay that one P allows, in floating point; a guess for others."""
-    P = witness.P[0]
-    if len(witness.P) > 1 or witness.G is not None or errors.ball:
-        return 0.0
-    factor = np.linalg.cholesky(P)
-    rates = []
-    for weights in np.eye(errors.count):
-        M = errors.at(weights, gains)[0]
-        turned = np.linalg.solve(factor, M.T @ factor).T
-        norm = np.linalg.norm(turned, 2) if errors.dt > 0.0 else np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1]
-        rates.append(float(norm))
-    return min(max(rates), 1.0) if errors.dt > 0.0 else max(-max(rates), 0.0)
 
 
 def _least(

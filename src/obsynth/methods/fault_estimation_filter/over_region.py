@@ -19,7 +19,7 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
-from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
+from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified_for_steps
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.fault_estimation_filter.turning_faults import synthesise_turning
@@ -136,13 +136,11 @@ def _certified(
         work = ErrorPolytope(
             errors.A, list(errors.C), B=np.eye(n), D=np.zeros((errors.outputs, n)), Cz=np.eye(n), dt=errors.dt
         )
-    lyapunov = "common" if steps is None else "vertex"
     level = method.gamma / parts.reach if method.gamma is not None and count else None
     options: dict[str, Any] = {
         "level": level,
         "margin": method.gamma_margin if margin is None else margin,
         "decay": None if method.decay is None else float(np.exp(-method.decay * errors.dt)),
-        "lyapunov": lyapunov,
         "steps": steps,
         "gains": gains,
         "solver": method.solver,
@@ -150,11 +148,11 @@ def _certified(
     }
     if count and gains is None and method.asks_for_free_weight is not False and errors.outputs:
         try:
-            return certified(work, free_output=True, **options)
+            return certified_for_steps(work, free_output=True, **options)
         except SolverError:
             if method.asks_for_free_weight:
                 raise
-    return certified(work, **options)
+    return certified_for_steps(work, **options)
 
 
 def _realised(
@@ -194,7 +192,7 @@ def _notes(
     plant: PolytopicSystem, parts: FilterOverRegion, certificate: VertexCertificate, steps: float | None
 ) -> tuple[str, ...]:
     notes = [certificate_note(plant, f"{rows_to_forget(certificate.decay)} rows")]
-    notes += unused_rate_notes(plant, steps)
+    notes += unused_rate_notes(plant, steps if certificate.witness.G is not None else None)
     if parts.reach != 1.0:
         notes.append(
             f"The effect of the faults changes with the scheduling: the estimates are divided by it, and gamma is the "

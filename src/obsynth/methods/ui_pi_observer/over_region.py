@@ -8,6 +8,7 @@ matrix of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_fr
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.rated_certificates import rated_certificate, rated_gains
 from obsynth.methods.engines.region_notes import certificate_note
-from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified, proved_decay
+from obsynth.methods.engines.vertex_certificates import VertexCertificate, analysed, certified, proved_decay
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
@@ -31,7 +32,7 @@ from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
-from obsynth.verification.over_region import GAIN_WITNESSES, forgetting_of, stored_witness
+from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, forgetting_of, stored_witness
 
 #: Options of the observer of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = ("poles", "region", "joint", "E_sharp", "C_sharp", "G", "constraints")
@@ -54,20 +55,36 @@ def synthesise_over_region(
     parts = pi_over_region(plant, model, noise=noise)
     steps = _steps(plant)
     progress("solving the inequalities at the vertices")
-    certificate = certified(
-        parts.errors,
-        margin=DESIGN_MARGIN,
-        decay=_scaled_decay(method.decay, parts, plant.dt),
-        lyapunov="common" if steps is None else "vertex",
-        steps=steps,
-        solver=solver,
-        settings=method.solver_options,
-    )
+    options: dict[str, Any] = {"margin": DESIGN_MARGIN, "solver": solver, "settings": method.solver_options}
+    decay = _scaled_decay(method.decay, parts, plant.dt)
     rate = None if plant.is_discrete else plant.scheduling.rate_of_weight
-    certificate = certificate if rate is None else _for_slow_courses(parts, certificate, rate, method)
+    try:
+        certificates = [certified(parts.errors, decay=decay, **options)]
+    except SolverError:
+        if steps is None:
+            raise
+        certificates = [certified(parts.errors, decay=decay, lyapunov="vertex", steps=steps, **options)]
+    if steps is not None and certificates[0].witness.G is None:
+        with suppress(SolverError):
+            needed = certificates[0].decay
+            certificates.append(certified(parts.errors, decay=needed, lyapunov="vertex", steps=steps, **options))
+    elif rate is not None:
+        certificates += _for_slow_courses(parts, certificates[0], rate, method)
     progress("building the realisation and its certificates")
-    made = _synthesis(plant, model, parts, certificate, steps, decay=method.decay, rate=rate)
-    return replace(made, options=method.resolved(model, plant.fault_names))
+    made = [_synthesis(plant, model, parts, each, steps, decay=method.decay, rate=rate) for each in certificates]
+    return replace(_best(made, plant.is_discrete), options=method.resolved(model, plant.fault_names))
+
+
+def _best(made: Sequence[Synthesis], discrete: bool) -> Synthesis:
+    """Return the last design whose gain is below that of the first, and whose decay is no slower."""
+    first, *others = made
+    one = first.certificate.claims
+    for each in others[::-1]:
+        other = each.certificate.claims
+        slower = other["region_decay"] - one["region_decay"]
+        if other.get("region_gain", 0.0) < one.get("region_gain", 0.0) and (slower if discrete else -slower) <= 0.0:
+            return each
+    return first
 
 
 def synthesis_of_gains(plant: PolytopicSystem, K_a: Sequence[FloatArray], fault_model: Any) -> Synthesis:
@@ -100,21 +117,21 @@ def _steps(plant: PolytopicSystem) -> float | None:
 
 def _for_slow_courses(
     parts: PiOverRegion, certificate: VertexCertificate, rate: float, method: UiPiObserver
-) -> VertexCertificate:
+) -> list[VertexCertificate]:
     """Return gains that are better for a slow parameter in continuous time, where they are, with one P for a decay."""
     errors, scaled = parts.errors, rate * parts.units.time
-    decay = _scaled_decay(method.decay, parts, 0.0)
+    decay = certificate.decay
     solver: dict[str, Any] = {"solver": method.solver, "settings": method.solver_options}
     try:
-        gains = rated_gains(errors, scaled, decay=decay or 0.0, **solver)
+        gains = rated_gains(errors, scaled, decay=decay, **solver)
         slow = rated_certificate(errors, scaled, gains, scale=certificate.level, **solver)
         if slow is None or slow.level >= certificate.level:
-            return certificate
+            return []
         # A step of implicit Euler shrinks errors in the norm of one P, which these gains need too.
         own = certified(errors, margin=DESIGN_MARGIN, decay=decay, gains=gains, **solver)
     except SolverError:
-        return certificate
-    return replace(own, runs=(*certificate.runs, *slow.runs, *own.runs))
+        return []
+    return [replace(own, runs=(*certificate.runs, *slow.runs, *own.runs))]
 
 
 def _scaled_decay(decay: float | None, parts: PiOverRegion, dt: float) -> float | None:
@@ -147,13 +164,13 @@ def _synthesis(
         G=None if certificate.witness.G is None else [G / states / states[:, None] for G in certificate.witness.G],
     )
     required_decay = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
-    shrinking = proved_decay(shipped.errors, shipped.none, witness, required=required_decay)
+    required = required_decay or (certificate.decay if plant.dt > 0.0 else certificate.decay / parts.units.time)
+    shrinking = proved_decay(shipped.errors, shipped.none, witness, required=required)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
     matrices |= stored_witness(witness)
     claims, runs, slow = {"region_decay": shrinking}, list(certificate.runs), None
     if plant.nf:
-        lyapunov = "common" if steps is None else "vertex"
-        gain = certified(shipped.errors, margin=ANALYSIS_MARGIN, gains=shipped.none, lyapunov=lyapunov, steps=steps)
+        gain = analysed(shipped.errors, shipped.none, steps=steps, margin=ANALYSIS_MARGIN)
         if rate is not None:
             slow = rated_certificate(shipped.errors, rate, shipped.none, scale=gain.level)
         used = slow if slow is not None and slow.level < gain.level else gain
@@ -163,6 +180,7 @@ def _synthesis(
         )
         claims["region_gain"] = used.level
         runs += used.runs
+    used_rate = slow is not None or any(names[1] in matrices for names in (WITNESSES, GAIN_WITNESSES))
     letters = {"U_a": U_a, "D_a": D_a, "Phi": model.Phi, "Cw": model.Cw}
     letters |= {f"K_a[{i + 1}]": K for i, K in enumerate(K_a)}
     return Synthesis(
@@ -171,7 +189,12 @@ def _synthesis(
         _observer(plant, made, shrinking),
         Certificate(matrices, claims),
         {"engine": "lmi", "runs": runs},
-        _notes(plant, shrinking, used=steps is not None or slow is not None, constant=len(certificate.gains) == 1),
+        _notes(
+            plant,
+            shrinking,
+            used=used_rate,
+            constant=len(certificate.gains) == 1,
+        ),
     )
 
 
