@@ -79,7 +79,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     panel.plot(
         seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold, by linear programmes"
     )
-    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms was found here")
+    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms, by the same")
     panel.plot(
         (test.samples - 1 - before) * test.observer.dt,
         test.threshold,
