@@ -10,6 +10,7 @@ from obsynth.analysis.existence.augmented_pencils import number
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
 from obsynth.methods.engines.kalman_problem import KalmanProblem
+from obsynth.methods.ui_pi_observer import synthesis
 from obsynth.numerics.arrays import FloatArray
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
@@ -243,3 +244,16 @@ def test_where_the_quietest_filter_is_lost_in_rounding_that_of_a_rate_is_taken()
     design = ui_pi_observer(plant)
     assert design.report.passed
     assert 1.0 <= design.certificate.claims["noise_price"] <= 10.0
+
+
+def test_a_gain_that_was_computed_to_compare_sensors_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, solved = np.random.default_rng(52), []
+    one = rng.normal(size=(3, 4))
+    C = np.vstack([one, one[0] * (1.0 + 1e-7 * rng.normal(size=4))])
+    plant = DescriptorSystem(None, 0.4 * rng.normal(size=(4, 4)), C=C, Bf=rng.normal(size=(4, 1)), dt=0.1)
+    problem = synthesis.placement_problem
+    monkeypatch.setattr(synthesis, "placement_problem", lambda *a, **k: solved.append(a[0].ny) or problem(*a, **k))
+    design = ui_pi_observer(plant)
+    assert design.report.passed
+    # With all sensors, and with those merged that nearly repeat others.
+    assert solved == [4, 3]

@@ -116,10 +116,15 @@ def synthesise(
     paper_matrices = method.given_decoupling()
     as_they_are = paper_matrices is not None or isinstance(weights.get("measurement"), Mapping)
     merged = None if as_they_are else merged_outputs(working)
+    tried: tuple[PlacementProblem, Choice] | None = None
     if method.decay is None and region is None and not as_they_are:
-        merged = _without_likeness(known, model, method, merged, weights)
+        merged, tried = _without_likeness(known, model, method, merged, weights)
     designed = working if merged is None else merged.plant
-    problem = placement_problem(designed, model, known.fixed_modes, joint=method.joint, paper_matrices=paper_matrices)
+    problem = (
+        tried[0]
+        if tried
+        else placement_problem(designed, model, known.fixed_modes, joint=method.joint, paper_matrices=paper_matrices)
+    )
     if method.G is not None:
         # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
         modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
@@ -132,7 +137,7 @@ def synthesise(
                 mode=unstable[0],
             )
     progress("choosing the gains")
-    gain, placed_poles, claims, runs = _chosen(method, problem, region, weights, plant.dt)
+    gain, placed_poles, claims, runs = tried[1] if tried else _chosen(method, problem, region, weights, plant.dt)
     if merged is not None and working.Bw.any() and "noise_price" in claims:
         picked = [working.output_names.index(name) for name in designed.output_names]
         single = designed.replace(Dw=working.Dw[picked])
@@ -157,15 +162,17 @@ def synthesise(
 
 def _without_likeness(
     known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
-) -> MergedOutputs | None:
-    """Return which outputs to merge where some nearly depend on others.  Placed poles do not see the noise: the quieter
-    one is taken.  Of two defaults that are as fast as their noise allows, the one with the outputs as they are is taken
-    where it is faster and no noisier, or far faster."""
+) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
+    """Return which outputs to merge where some nearly depend on others, with the problem and its gain where these were
+    computed for the comparison.  Placed poles do not see the noise: the quieter one is taken.  Of two defaults that are
+    as fast as their noise allows, the one with the outputs as they are is taken where it is faster and no noisier, or
+    far faster."""
     near = nearly_merged_outputs(known.plant)
     if near is None:
-        return merged
-    costs = []
+        return merged, None
+    costs, results = list[tuple[float, float]](), list[tuple[PlacementProblem, Choice] | None]()
     for choice in (merged, near):
+        results.append(None)
         try:
             problem = placement_problem(
                 known.plant if choice is None else choice.plant,
@@ -174,11 +181,12 @@ def _without_likeness(
                 joint=method.joint,
                 paper_matrices=None,
             )
-            gain = _chosen(method, problem, None, weights, known.plant.dt)[0]
+            chosen = _chosen(method, problem, None, weights, known.plant.dt)
         except (ObsynthError, np.linalg.LinAlgError):
             costs.append((np.inf, np.inf))
             continue
-        U, D, K = problem.gains(gain)
+        results[-1] = problem, chosen
+        U, D, K = problem.gains(chosen[0])
         means = np.eye(known.plant.ny) if choice is None else choice.weights
         observer = assembled(
             known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint
@@ -187,13 +195,13 @@ def _without_likeness(
         settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
         costs.append((fault_deviation(known.plant, observer), settling))
     (noise, settling), (near_noise, near_settling) = costs
-    if not np.isfinite(near_settling):
-        return merged
     if method.poles is not None:
-        return near if near_noise <= AS_FAST * noise else merged
-    if near_settling <= AS_FAST * settling:
-        return near
-    return near if near_noise * AS_FAST < noise and near_settling < FAR_SLOWER * settling else merged
+        takes_near = near_noise <= AS_FAST * noise
+    else:
+        quieter = near_noise * AS_FAST < noise and near_settling < FAR_SLOWER * settling
+        takes_near = near_settling <= AS_FAST * settling or quieter
+    takes_near = takes_near and bool(np.isfinite(near_settling))
+    return (near, results[1]) if takes_near else (merged, results[0])
 
 
 def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str) -> Choice:
