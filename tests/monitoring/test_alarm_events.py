@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from obsynth.monitoring.alarms.events import (
     NOT_VALID,
     AlarmEvent,
@@ -14,6 +17,8 @@ from obsynth.monitoring.alarms.events import (
     rows_in_alarm,
     time_in_alarm,
 )
+from obsynth.monitoring.thresholds.alarm_ranking import Ranking
+from obsynth.monitoring.thresholds.monitor import NOT_DISTINGUISHED, Monitor, Rule, RuleOutput, Sample
 
 COLUMNS = ("fhat[leak]", "fhat[clog]", "sd fhat[leak]", "sd fhat[clog]")
 
@@ -77,3 +82,40 @@ def test_the_share_of_time_in_alarm_is_told_beside_the_events():
         "In alarm by fhat[f]: 3 of 80 rows (3.75 %), 1 alarm, the longest over 10 rows.",
     ]
     assert time_in_alarm((), 80) == []
+
+
+class Ranked(Rule):
+    """A rule that alarms and does not tell the faults apart, with a ranking beside it."""
+
+    def __init__(self, ranking: Ranking | None) -> None:
+        self.ranking = ranking
+
+    def init(self) -> None:
+        return None
+
+    def step(self, state: None, sample: Sample) -> tuple[None, RuleOutput]:
+        return None, RuleOutput(2.0, 1.0, NOT_DISTINGUISHED, (), self.ranking)
+
+    def restart(self, state: None, skipped: int = 0) -> None:
+        return None
+
+    def options(self) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("ties", "named", "shown"),
+    [((), "leak", "leak"), (("clog", "sensor L1"), "", "leak or clog or sensor L1 (not distinguished yet)")],
+)
+def test_shares_name_a_fault_where_they_suffice_and_else_all_that_are_as_likely(
+    ties: tuple[str, ...], named: str, shown: str
+) -> None:
+    shares = (("leak", 0.4), *((name, 0.3) for name in ties), ("none of these faults", 0.0))
+    monitor = Monitor("learned", "", Ranked(Ranking(shares, "leak", ties)), 1, ("leak", "clog"), np.ones(2))
+    _, output = monitor.step(monitor.init(), Sample(0.0, np.ones(1), np.ones(2), None))
+    assert output.fault == named
+    log = AlarmLog(COLUMNS)
+    log.take("learned", output.fault, 2.0, 0.0, 1, (0.5, 0.0, 0.1, 0.1), distinguished=bool(output.fault),
+             ranking=output.ranking)  # fmt: skip
+    heading, row = alarm_rows(log.events(), str)[0]
+    assert dict(zip(heading, row, strict=True))["fault"] == shown

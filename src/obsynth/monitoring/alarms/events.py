@@ -136,6 +136,11 @@ class AlarmEvent:
         return bool(self.fault) and not self.ties and self.fault != NONE_OF_THESE and not self.low < 0.0 < self.high
 
     @property
+    def candidates(self) -> tuple[str, ...]:
+        """What the alarm may be, all as likely, where hypotheses were ranked."""
+        return tuple(name for name, _ in self.shares[: len(self.ties) + 1])
+
+    @property
     def valid(self) -> bool:
         """Whether the interval is known and rests on nothing that the alarm itself contradicts."""
         return not math.isnan(self.low) and self.by not in CONTRADICTING
@@ -281,7 +286,8 @@ def fault_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
     if not math.isnan(event.shelved):
         return f"{event.fault} ({SHELVED.format(date_of(event.shelved))})"
     if not event.distinguished:
-        return NOT_DISTINGUISHED_YET
+        candidates = " or ".join(event.candidates)
+        return f"{candidates} ({NOT_DISTINGUISHED_YET})" if candidates else NOT_DISTINGUISHED_YET
     if not event.fault:
         return ""
     named = " or ".join(dict.fromkeys([event.fault, *event.ties]))

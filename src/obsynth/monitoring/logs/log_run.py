@@ -425,7 +425,9 @@ class LogRun:
                 self.isolated = self.isolated or output.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 since = self.events.shelved_since(kind)
-                fault_text = output.fault if math.isnan(since) else SHELVED.format(self._time_text(since))
+                # What is as likely as another is not named, but the others are excluded.
+                candidates = "" if output.ranking is None else output.ranking.candidates
+                fault_text = output.fault or candidates if math.isnan(since) else SHELVED.format(self._time_text(since))
                 names.append(f"{kind}: {fault_text}" if fault_text else kind)
         for name, evidence in self._stuck(row):
             self.events.take(name, "", evidence, time, number, [*before, *cells])

@@ -26,6 +26,11 @@ class Ranking(NamedTuple):
         """Whether it is called by a sensor."""
         return self.named.startswith(SENSOR)
 
+    @property
+    def candidates(self) -> str:
+        """All that is as likely, faults of the plant first."""
+        return " or ".join((self.named, *self.ties))
+
     def called(self, faults: Sequence[str]) -> str:
         """Return the name of an alarm: empty where several ``faults`` of the plant are as likely."""
         return "" if self.named in faults and any(name in faults for name in self.ties) else self.named
