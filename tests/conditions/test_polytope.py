@@ -11,6 +11,7 @@ import pytest
 from obsynth.conditions import ErrorPolytope, vertex_inequalities
 from obsynth.conditions.polytope import witness_of
 from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.fastest_decay import fastest_of
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.proofs.vertex_inequalities import Witness, pairs_of, prove_decay, prove_gain, prove_mean_square
 from obsynth.verification.over_region import worst_switching
@@ -261,3 +262,15 @@ def test_a_remainder_in_continuous_time_is_covered() -> None:
     vertices = errors.closed(made.gains)
     assert prove_gain(vertices, made.witness, made.level, discrete=False, ball=0.5).proved
     assert not prove_gain(vertices, made.witness, made.level, discrete=False, ball=0.55).proved
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_the_fastest_decay_of_a_matrix_is_where_its_proof_ends(dt: float) -> None:
+    errors = ErrorPolytope([[[0.3, 0.2], [-0.1, 0.4]], [[0.1, 0.5], [0.0, 0.2]]], np.zeros((0, 2)), dt=dt)
+    errors = errors if dt else ErrorPolytope([a - np.eye(2) for a in errors.A], np.zeros((0, 2)), dt=dt)
+    witness = Witness([np.array([[1.0, 0.1], [0.1, 2.0]])])
+    rate = fastest_of(errors, _NO_GAIN, witness)
+    assert rate is not None
+    closed, room = errors.closed(_NO_GAIN), 1e-9 * (1.0 if dt else -1.0)
+    assert prove_decay(closed, witness, rate + room, discrete=dt > 0.0).proved
+    assert not prove_decay(closed, witness, rate - room, discrete=dt > 0.0).proved

@@ -25,7 +25,7 @@ import numpy as np
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
 from obsynth.conditions.lmi import MARGIN
-from obsynth.conditions.polytope import MOST_ROOM, TRACE, descriptor_variables
+from obsynth.conditions.polytope import MOST_DECAY_ROOM, MOST_ROOM, TRACE, descriptor_variables
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, require_shape, shown
@@ -83,6 +83,7 @@ def slope_inequality(
     decay: float | None = None,
     gain: FloatArray | None = None,
     gain_limit: float | None = None,
+    decay_metric: FloatArray | None = None,
     margin: float = MARGIN,
 ) -> Conditions:
     """Return the inequality with a multiplier, in P and Y.
@@ -103,6 +104,9 @@ def slope_inequality(
         A given gain ``(n, m)``, which is analysed.
     gain_limit : float, optional
         The largest Frobenius norm of Y.
+    decay_metric : array_like, optional
+        P of an earlier solution, for goal "decay": the slack is then sought in multiples of it, by which the next decay
+        follows (Dinkelbach's iteration).
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
@@ -128,6 +132,8 @@ def slope_inequality(
     True
     """
     _require_options(errors, goal, multiplier, decay)
+    if decay_metric is not None and goal != "decay":
+        raise SpecError("A metric of the decay is for goal 'decay': leave it out.", path="decay_metric")
     own = errors.nominal
     n, k, m, p = own.order, own.differential or own.order, own.outputs, own.inputs
     P, G = descriptor_variables(n, k)
@@ -138,7 +144,7 @@ def slope_inequality(
     Y = cp.vstack([Y1, np.zeros((n - k, m))]) if k < n else Y1
     Y = Y if given is None else G.T @ given
     room = cp.Variable(name="room") if goal == "decay" or level is not None else None
-    slack: Any = margin if room is None else room
+    slack: Any = margin if room is None or decay_metric is not None else room
     name = "gamma_squared" if goal == "gain" else "mean_square"
     squared: Any = cp.Variable(nonneg=True, name=name) if level is None else level**2
     multipliers: dict[str, Any] = {}
@@ -164,8 +170,10 @@ def slope_inequality(
         constraints["trace"] = cp.trace(noise) + slack <= squared
         constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
     if decay is not None:
-        with_multiplier("decay", 2.0 * decay * P, driven=False)
-    constraints |= _limits(goal, P, room, Y1, gain_limit if given is None else None)
+        beside = 0.0 if decay_metric is None or room is None else 2.0 * room * np.asarray(decay_metric)
+        with_multiplier("decay", 2.0 * decay * P + beside, driven=False)
+    most = MOST_ROOM if decay_metric is None else MOST_DECAY_ROOM
+    constraints |= _limits(goal, P, (room, most), Y1, gain_limit if given is None else None)
     objective = cp.Minimize(squared) if room is None else cp.Maximize(room)
     variables = {part.name(): part for part in (*P.variables(), *G.variables(), *([Y1] if given is None else []))}
     variables |= {"room": room} if room is not None else {name: squared}
@@ -192,11 +200,12 @@ def _no_design(_: dict[str, FloatArray], name: str) -> ObserverDesign:
     raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")
 
 
-def _limits(goal: str, P: Any, room: Any, Y: Any, gain_limit: float | None) -> dict[str, Any]:
+def _limits(goal: str, P: Any, slack: tuple[Any, float], Y: Any, gain_limit: float | None) -> dict[str, Any]:
     """Return what bounds the slack, the scale of a homogeneous inequality, and the gain."""
     limits: dict[str, Any] = {}
+    room, most = slack
     if room is not None:
-        limits["room"] = room <= MOST_ROOM
+        limits["room"] = room <= most
     if goal == "decay":
         limits["trace"] = cp.trace(P) <= TRACE * P.shape[0]
     if gain_limit is not None:

@@ -14,22 +14,27 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import is_positive
 from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.verification.error_polytope import ErrorPolytope
 
 #: Where the iteration ends at the latest; on random regions it took two to nine solutions.
 MOST_STEPS = 12
+#: The next decay that is tried lies beyond the one that was reached, by this multiple of the last progress: where the
+#: slack there is negative its solution still reaches some decay.  Where the best P is nearly singular plain ones creep.
+OVERSHOOT = 0.5
 #: Relative progress, of a rate or of the distance of a factor to one, at which it ends: it converges faster than
 #: linearly, so that what is missing is less.
-PROGRESS = 1e-3
+PROGRESS = 3e-4
 
 
 def fastest_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness) -> float | None:
     """Return the fastest decay that Lyapunov matrices allow, in floating point; ``None`` where they allow none.
 
-    A factor a sample in discrete time, else a rate in 1/s; not for remainders beside A.
+    A factor a sample in discrete time, else a rate in 1/s.
     """
-    if errors.ball:
+    t = witness.multiplier
+    if errors.ball and not t > 0.0:
         return None
     reached = []
     for now, then in witness.pairs_of(errors.count):
@@ -37,19 +42,26 @@ def fastest_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witn
         P, after = _mean(witness.P, now), _mean(witness.P, then)
         G = P if witness.G is None else _mean(witness.G, now)
         if errors.dt > 0.0:
-            low = G + G.T - after
-            crossed = G.T @ M
-            squared = _largest(crossed.T @ np.linalg.solve(low, crossed), P)
+            crossed, low, rest = G.T @ M, G + G.T - after, 0.0 * P
+            if errors.ball:
+                low, rest = low - G.T @ G / t, errors.ball**2 * t * np.eye(len(P))
+            squared = _largest(rest + crossed.T @ np.linalg.solve(low, crossed), P) if is_positive(low) else None
             reached.append(None if squared is None else -float(np.sqrt(max(squared, 0.0))))
         else:
             flow = -(G.T @ M + M.T @ G)
-            # flow - 2 a P stays positive definite until a is half the inverse of the largest eigenvalue of (P, flow).
-            largest = _largest(P, flow)
-            reached.append(None if largest is None or largest <= 0.0 else 0.5 / largest)
+            if errors.ball:
+                flow = flow - errors.ball**2 * t * np.eye(len(P)) - P @ P / t
+            reached.append(rate_within(flow, P))
     if any(each is None for each in reached):
         return None
     least = min(each for each in reached if each is not None)
     return -least if errors.dt > 0.0 else least
+
+
+def rate_within(flow: FloatArray, P: FloatArray) -> float | None:
+    """Return the largest a with ``flow - 2 a P`` positive semidefinite; ``None`` where ``flow`` is not definite."""
+    largest = _largest(P, flow)
+    return None if largest is None or largest <= 0.0 else 0.5 / largest
 
 
 def _largest(above: FloatArray, below: FloatArray) -> float | None:
@@ -64,8 +76,8 @@ def _largest(above: FloatArray, below: FloatArray) -> float | None:
 
 def faster(
     solved: Callable[[float, Any], tuple[float, Any] | None], rate: float, metric: Any, *, discrete: bool
-) -> tuple[float, Any]:
-    """Return the fastest decay that is reached, and the solution that reaches it.
+) -> list[tuple[float, Any]]:
+    """Return decays, each faster than the one before, and the solutions that reach them.
 
     Parameters
     ----------
@@ -79,18 +91,20 @@ def faster(
     discrete : bool
         Whether decays are factors: the smaller the better.
     """
+    reached, beyond = [(rate, metric)], 0.0
     for _ in range(MOST_STEPS):
-        made = solved(rate, metric)
-        if made is None:
-            return rate, metric
-        gained = rate - made[0] if discrete else made[0] - rate
-        if gained <= 0.0:
-            return rate, metric
-        size = max(1.0 - rate, PROGRESS) if discrete else max(rate, PROGRESS)
-        rate, metric = made
-        if gained <= PROGRESS * size:
+        rate, metric = reached[-1]
+        made = solved(max(rate - beyond, 0.0) if discrete else rate + beyond, metric)
+        gained = 0.0 if made is None else rate - made[0] if discrete else made[0] - rate
+        if made is not None and gained > 0.0:
+            reached.append(made)
+        if gained > PROGRESS * max(1.0 - rate if discrete else rate, PROGRESS):
+            beyond = OVERSHOOT * gained
+        elif beyond:
+            beyond = 0.0
+        else:
             break
-    return rate, metric
+    return reached
 
 
 def _mean(parts: Sequence[FloatArray], weights: FloatArray) -> FloatArray:

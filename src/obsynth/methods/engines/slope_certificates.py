@@ -16,11 +16,11 @@ import numpy as np
 from obsynth.conditions.problem import Conditions
 from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
 from obsynth.errors import SolverError
+from obsynth.methods.engines.fastest_decay import faster, rate_within
 from obsynth.methods.engines.vertex_certificates import (
-    BISECTION_SHARE,
     DECAY_ROOM,
+    DECAY_SHARES,
     LEVEL_UNITS,
-    MOST_BISECTIONS,
     MOST_RESCALINGS,
     ROOMS,
     has_numbers,
@@ -123,7 +123,7 @@ def certified_slopes(
 def best_decay_of_slopes(
     errors: SlopedErrors, *, gain: FloatArray | None, limit: float
 ) -> tuple[float, Witness, FloatArray]:
-    """Return the fastest decay that is proved, its certificate and a gain, by bisection.
+    """Return the fastest decay that is proved, its certificate and a gain.
 
     Parameters
     ----------
@@ -140,26 +140,37 @@ def best_decay_of_slopes(
         No decay at all is proved.
     """
     balanced, factors = _balanced(errors)
-    low, high, trial = 0.0, limit, 0.0
-    best: tuple[float, Witness, FloatArray] | None = None
-    for _ in range(MOST_BISECTIONS):
+
+    def solved(rate: float, earlier: Conditions | None) -> tuple[float, Conditions] | None:
+        if earlier is not None and rate >= limit:
+            return None
+        metric = None if earlier is None else earlier.gains()["P"]
         problem = slope_inequality(
-            balanced, goal="decay", multiplier="diagonal", decay=trial, gain=gain, gain_limit=limit
+            balanced, goal="decay", multiplier="diagonal", decay=rate, gain=gain, gain_limit=limit, decay_metric=metric
         )
-        good = has_numbers(problem, "CLARABEL", None, [])
-        if good:
+        if not has_numbers(problem, "CLARABEL", None, []):
+            return None
+        reached = _fastest(balanced, problem.gains())
+        return None if reached is None else (reached, problem)
+
+    start = solved(0.0, None)
+    if start is not None:
+        for rate, problem in reversed(faster(solved, *start, discrete=False)):
             L, witness = problem.gains()["L[1]"], _witness(problem, errors, factors, "decay", 1.0)
-            good = prove_decay(errors.closed(L), witness, trial, discrete=False).proved
-            best = (trial, witness, L) if good else best
-        if best is None:
-            raise SolverError(f"No certificate of stability for the slopes was found. {_INCONCLUSIVE}")
-        low, high = (trial, high) if good else (low, trial)
-        trial = 0.5 * (low + high)
-        if high - low <= BISECTION_SHARE * max(high, BISECTION_SHARE):
-            break
-    if best is None:
-        raise SolverError(f"No certificate of stability for the slopes was found. {_INCONCLUSIVE}")
-    return best
+            for trial in (min(rate, limit) * (1.0 - share) for share in DECAY_SHARES):
+                if prove_decay(errors.closed(L), witness, trial, discrete=False).proved:
+                    return trial, witness, L
+    raise SolverError(f"No certificate of stability for the slopes was found. {_INCONCLUSIVE}")
+
+
+def _fastest(errors: SlopedErrors, values: Mapping[str, FloatArray]) -> float | None:
+    """Return the fastest decay that Lyapunov matrices and multipliers allow, in floating point."""
+    own, G, T, L = errors.nominal, values["G"], np.diag(values["T[decay]"]), values["L[1]"]
+    GA, GW = G.T @ (own.A[0] - L @ own.C[0]), G.T @ (errors.W - L @ errors.Wy)
+    flow = np.block([[-(GA + GA.T + errors.V.T @ T @ errors.V), -GW], [-GW.T, T]])
+    P = np.zeros_like(flow)
+    P[: own.order, : own.order] = values["P"]
+    return rate_within(flow, P)
 
 
 def _balanced(errors: SlopedErrors) -> tuple[SlopedErrors, FloatArray]:

@@ -45,9 +45,6 @@ MOST_FAST = 128
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
 #: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
 CLAIM_ROUNDINGS = 6
-#: Trials of a bisection for the best decay, and where it ends.
-MOST_BISECTIONS = 40
-BISECTION_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +302,7 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
         reached = fastest_of(moved, gains, witness)
         return None if reached is None else (reached, list(witness.P))
 
-    fastest, _ = faster(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)
+    fastest, _ = faster(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)[-1]
     for margin in DECAY_MARGINS:
         made = search.at(first.level, z_unit, fastest + margin * (1.0 - fastest), first.least)
         if made is not None:
@@ -347,7 +344,7 @@ def best_decay(
     slowest: float = 1.0,
     **options: Any,
 ) -> tuple[float, Witness, list[FloatArray]]:
-    """Return the fastest decay that is proved, its certificate and gains, by bisection.
+    """Return the fastest decay that is proved, its certificate and gains.
 
     Parameters
     ----------
@@ -370,41 +367,41 @@ def best_decay(
     """
     discrete = errors.dt > 0.0
     units = ErrorUnits.of(errors)
-    moved = units.moved(1.0)
-    low, high = (0.0, slowest) if discrete else (0.0, limit)
-    best: tuple[float, Witness, list[FloatArray]] | None = None
-    trial = high if discrete else low
-    for _ in range(MOST_BISECTIONS):
+    moved, steps, own = units.moved(1.0), options.get("steps"), units.gains_in(gains)
+    Solution = tuple[Witness, list[FloatArray]]
+
+    def solved(rate: float, earlier: Solution | None) -> tuple[float, Solution] | None:
+        if earlier is not None and not discrete and rate >= limit:
+            return None
+        more: dict[str, Any] = {} if earlier is None else {"decay_metric": earlier[0].P}
         problem = vertex_inequalities(
-            moved,
-            goal="decay",
-            decay=trial,
-            gains=units.gains_in(gains),
-            gain_limit=None if gains else limit,
-            **options,
+            moved, goal="decay", decay=rate, gains=own, gain_limit=None if gains else limit, **options, **more
         )
-        good = has_numbers(problem, "CLARABEL", None, [])
-        if good:
-            inner, own = witness_of(moved, problem, steps=options.get("steps"))
-            made = [units.gain_out(L) for L in own] if gains is None else list(gains)
+        if not has_numbers(problem, "CLARABEL", None, []):
+            return None
+        solution = witness_of(moved, problem, steps=steps)
+        reached = fastest_of(moved, solution[1], solution[0])
+        return None if reached is None else (reached, solution)
+
+    start = solved(slowest if discrete else 0.0, None)
+    if start is not None:
+        for rate, (inner, scaled) in reversed(faster(solved, *start, discrete=discrete)):
+            made = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
             witness = units.witness_out(inner, 1.0)
-            good = prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved
-            best = (trial, witness, made) if good else best
-        if good == discrete:
-            high = trial
-        else:
-            low = trial
-        if best is None and trial in ((slowest,) if discrete else (0.0,)):
-            break
-        trial = 0.5 * (low + high)
-        if high - low <= BISECTION_SHARE * max(high, BISECTION_SHARE):
-            break
-    if best is None:
-        raise SolverError(
-            "No certificate of stability at the vertices was found. That is no proof that there is none: give "
-            f"{_remedy(errors)}."
-        )
-    return best
+            for trial in _decays_to_try(min(rate, slowest if discrete else limit), slowest if discrete else None):
+                if prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved:
+                    return trial, witness, made
+    raise SolverError(
+        "No certificate of stability at the vertices was found. That is no proof that there is none: give "
+        f"{_remedy(errors)}."
+    )
+
+
+def _decays_to_try(fastest: float, slowest: float | None) -> list[float]:
+    """Return decays from the fastest on, to ``slowest`` in discrete time and to none in continuous time."""
+    if slowest is None:
+        return [fastest * (1.0 - share) for share in DECAY_SHARES]
+    return [fastest + share * (slowest - fastest) for share in DECAY_SHARES]
 
 
 def proved_decay(
@@ -417,10 +414,7 @@ def proved_decay(
         fastest = 0.0
     fastest = min(fastest, 1.0) if discrete else fastest
     tries = [] if required is None else [required]
-    if discrete:
-        tries += [fastest + share * (1.0 - fastest) for share in DECAY_SHARES]
-    else:
-        tries += [fastest * (1.0 - share) for share in DECAY_SHARES]
+    tries += _decays_to_try(fastest, 1.0 if discrete else None)
     for rate in tries:
         if prove_decay(vertices, witness, rate, discrete=discrete, ball=errors.ball).proved:
             return rate
