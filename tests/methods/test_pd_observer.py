@@ -594,3 +594,15 @@ def test_a_region_beside_what_its_inequality_knows_nothing_of_is_refused(region:
     plant = obsynth.DescriptorSystem(A=[[-1.0, 0.2], [0.1, -2.0]], C=np.eye(2), Bf=[[1.0], [0.0]])
     with pytest.raises(obsynth.SpecError, match=f"region cannot be combined with {next(iter(beside))}"):
         obsynth.pd_observer(plant, region=region, **beside)
+
+
+def test_white_noise_in_a_constraint_is_named_where_outputs_would_differentiate_it() -> None:
+    plant = obsynth.DescriptorSystem(
+        np.diag([1.0, 1.0, 0.0]), [[-1.0, 0.5, 0.4], [0.0, -2.0, -0.2], [-0.2, -0.2, 0.0]],
+        C=[[1.0, 0.0, 1.5], [1.0, -1.5, 1.0]], Bf=[[1.0], [0.5], [0.0]], Bw=[[0.1], [0.0], [-0.1]], Dw=np.zeros((2, 1)),
+    )  # fmt: skip
+    with pytest.raises(
+        obsynth.PreconditionError, match=r"need the derivative of w1, white noise in a constraint\. Leave that"
+    ):
+        obsynth.pd_observer(plant)
+    assert obsynth.pd_observer(plant.replace(Bw=None, Dw=None, noise_names=None)).report.passed

@@ -23,6 +23,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.index_reduction import improper_outputs
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.proofs.exact_arithmetic import holds_computed
 from obsynth.proofs.exact_pencils import ExactPencil
@@ -93,8 +94,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         float(index),
         1.0,
         "ours: elimination of algebraic states",
-        f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
-        "Differentiate the constraints first.",
+        f"index {index}: {_differentiated(plant) if index > 1 else ''}",
         unclear=floating,
         of_the_method=True,
     )
@@ -108,6 +108,20 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         "none: every state is algebraic. Solve the equations directly.",
         unclear=floating,
     )
+
+
+def _differentiated(plant: DescriptorSystem) -> str:
+    """Return which signals a constraint of a plant of index 2 or more makes outputs differentiate, and what to do."""
+    outputs, signals = improper_outputs(plant)
+    if not outputs:
+        return (
+            "the algebraic equations cannot be solved for the algebraic states without differentiating. Do that first."
+        )
+    names, many = ", ".join(signals), len(outputs) > 1
+    needed = f"the output{'s' if many else ''} {', '.join(outputs)} need{'' if many else 's'} the derivative of {names}"
+    if set(signals) <= set(plant.noise_names):
+        return f"{needed}, white noise in a constraint. Leave that noise out of Bw."
+    return f"{needed}, as a constraint ties them to it."
 
 
 def _pencil_facts(judge: Evaluator) -> tuple[tuple[int, int, int], bool]:
