@@ -117,6 +117,19 @@ def test_faults_may_be_unknown_and_axes_given() -> None:
     assert len(plt.get_fignums()) == 1
 
 
+def test_a_truth_that_is_known_in_part_has_gaps_and_equal_legends_are_one() -> None:
+    names, steps = ("leak", "drift", "bias"), 20
+    zeros, truth = np.zeros((steps, 3)), np.ones((steps, 3))
+    truth[5:9, 0], truth[:, 2] = np.nan, np.nan
+    run = Estimates(zeros[:, :1], zeros, zeros, ("x",), names, names, (0,), (0, 0, 0))
+    panels = plot_faults(run, faults=truth)
+    drawn = [panel.get_lines() for panel in panels]
+    assert [len(lines) for lines in drawn] == [2, 2, 1]
+    np.testing.assert_array_equal(drawn[0][0].get_ydata(), truth[:, 0])
+    assert [panel.get_legend() is None for panel in panels] == [False, True, False]
+    assert legend_of(panels[2]) == ["estimate"]
+
+
 def test_the_norm_of_the_residual_and_the_first_crossing() -> None:
     residuals = np.tile([0.3, 0.4], (STEPS, 1))
     residuals[12:] *= 4.0

@@ -62,7 +62,7 @@ def plot_faults(
     estimates : Estimates
         From a run of an observer; ``faults (steps, nf)``.
     faults : array_like, optional
-        True faults ``(steps, nf)``, not delayed; a single one may be ``(steps,)``.
+        True faults ``(steps, nf)``, not delayed, NaN where not known; a single one may be ``(steps,)``.
     dt : float, optional, seconds
         Time between samples.
     units : mapping, optional
@@ -106,8 +106,13 @@ def plot_faults(
         delays=estimates.fault_delays,
     )
     share_scale(panels, [(units or {}).get(name) for name in estimates.fault_names])
+    above: list[str] = []
     for panel in panels:
-        legend_above(panel)
+        labels = panel.get_legend_handles_labels()[1]
+        # One above the other, panels share a legend that says the same; axes of the caller stand anywhere.
+        if axes is not None or labels != above:
+            legend_above(panel)
+        above = labels
     return panels
 
 
@@ -287,7 +292,7 @@ def _draw(
     time, steps = dt * np.arange(len(values)), len(values)
     for panel, i in zip(panels, chosen, strict=True):
         late = 0 if delays is None else delays[i]
-        if true is not None:
+        if true is not None and not np.isnan(true[:, i]).all():
             label = f"{word}, delayed by {late} sample{'s' * (late > 1)}" if late else word
             panel.plot(time[late:], true[: steps - late, i], **TRUE_STYLE, label=label)
         if deviations is not None:
@@ -315,11 +320,13 @@ def _share_within(true: FloatArray, low: FloatArray, high: FloatArray) -> str:
 
 
 def _matching(values: ArrayLike | None, shape: tuple[int, ...], what: str) -> FloatArray | None:
-    """Return the truth ``(samples, n)``; a single signal may be ``(samples,)``."""
+    """Return the truth ``(samples, n)``, NaN where it is not known; a single signal may be ``(samples,)``."""
     if values is None:
         return None
     raw = np.asarray(values)
-    true = as_matrix(raw[:, None] if raw.ndim == 1 else raw, "true signals")
+    raw = raw[:, None] if raw.ndim == 1 else raw
+    unknown = np.isnan(raw) if raw.dtype.kind == "f" else np.zeros(raw.shape, dtype=bool)
+    true = np.where(unknown, np.nan, as_matrix(np.where(unknown, 0.0, raw) if unknown.any() else raw, "true signals"))
     if true.shape != shape:
         raise SpecError(
             f"The true signals have shape {true.shape}, but the estimates {shape} (samples by signals).", path=what
