@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from benchmarks.campaigns import optimal_filters
+
+import obsynth
+from obsynth.verification.invisible_faults import with_independent_outputs
 
 
 @pytest.mark.parametrize(
@@ -19,3 +23,37 @@ def test_gain_and_least_gain_of_a_random_plant_meet(seed: int) -> None:
     assert (outcome.result, outcome.wrong) == ("designed", "")
     assert outcome.value is not None
     assert outcome.value < 1e-7
+
+
+def read_by(mixing: np.ndarray) -> obsynth.DescriptorSystem:
+    """Return a plant whose outputs are combinations of three."""
+    rng = np.random.default_rng(4)
+    a = rng.standard_normal((3, 3))
+    a *= 0.8 / max(abs(np.linalg.eigvals(a)))
+    return obsynth.DescriptorSystem(
+        A=a,
+        C=mixing @ rng.standard_normal((3, 3)),
+        Bf=rng.standard_normal((3, 1)),
+        Bw=np.hstack([0.3 * rng.standard_normal((3, 2)), np.zeros((3, 3))]),
+        Dw=np.hstack([np.zeros((len(mixing), 2)), 0.3 * mixing]),
+        dt=1.0,
+    )
+
+
+@pytest.mark.parametrize("copy", [[1.0, 0.0, 0.0], [0.0, -2.0, 0.0]], ids=["copied", "copied with a factor"])
+def test_the_least_gain_of_a_plant_with_a_copied_sensor_is_that_without_it(copy: list[float]) -> None:
+    once, twice = (
+        obsynth.optimal_filter(read_by(mixing), delay=1) for mixing in (np.eye(3), np.vstack([np.eye(3), copy]))
+    )
+    assert twice.report.passed
+    assert twice.gain == pytest.approx(once.gain, rel=1e-8)
+    assert twice.least == pytest.approx(once.least, rel=1e-8)
+
+
+def test_a_sensor_that_is_a_copy_but_for_its_last_digit_is_not_left_out_of_a_proof() -> None:
+    mixing = np.vstack([np.eye(3), [1.0, 0.0, 0.0]])
+    plant = read_by(mixing)
+    nearly = plant.C.copy()
+    nearly[3, 0] = np.nextafter(nearly[3, 0], np.inf)
+    assert with_independent_outputs(plant).output_names == plant.output_names[:3]
+    assert with_independent_outputs(plant.replace(C=nearly)).ny == 4

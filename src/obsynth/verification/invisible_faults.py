@@ -25,9 +25,10 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
+from obsynth.proofs.exact_arithmetic import stored_matrix
 from obsynth.verification.worst_invisible import Directions, Kernel, Model, Shown, Through, kernel, worst_directions
 
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
@@ -82,6 +83,23 @@ def seen_plant(plant: DescriptorSystem, decoupled: Sequence[str]) -> DescriptorS
     )
 
 
+def with_independent_outputs(plant: DescriptorSystem) -> DescriptorSystem:
+    """Return the plant without outputs that are combinations of others, exactly: they show nothing more.
+
+    Stored numbers count as they are: of outputs that depend on each other but for rounding none is left out.
+    """
+    shown = np.hstack([plant.C, plant.Df, plant.Dd, plant.Dw])
+    if decide_rank(shown).rank == plant.ny:
+        return plant
+    echelon, rank = stored_matrix(shown.T).rref()
+    if rank == plant.ny:
+        return plant
+    entries, width = echelon.entries(), plant.ny
+    own = [next(j for j in range(width) if entries[i * width + j] != 0) for i in range(rank)]
+    rows = {name: getattr(plant, name)[own] for name in ("C", "D", "Df", "Dd", "Dw")}
+    return plant.replace(**rows, output_names=[plant.output_names[i] for i in own])
+
+
 def hidden_and_bounded(
     plant: DescriptorSystem, setting: Setting
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
@@ -125,7 +143,7 @@ def proved_least(
         return None
     if not all(_grows(flint.acb(point), plant) for point in points):
         return None
-    samples = samples if plant.is_discrete else 0
+    samples, plant = samples if plant.is_discrete else 0, with_independent_outputs(plant)
     bound = _of_worst_directions(plant, points, samples, setting, level, level if enough is None else enough)
     if bound is not None:
         return bound
@@ -197,6 +215,7 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
     """
     if not _grows(flint.acb(point), plant):
         return None
+    plant = with_independent_outputs(plant)
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:

@@ -10,7 +10,7 @@ import scipy.linalg
 
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed
+from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed, designed
 from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
@@ -22,7 +22,7 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
-from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit
+from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit, with_independent_outputs
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
@@ -134,7 +134,14 @@ def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
 def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
     """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
     fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
-    setting, plant = fault_map.setting, fault_map.driven(plant)
+    independent = with_independent_outputs(plant)
+    if independent.ny < plant.ny:
+        # The filter is one for added noise, and so is the worst noise: without the others it needs none.
+        worst = designed(independent, fault_map, "hinf")
+        chosen = chosen._replace(
+            problem=worst.problem, limit=worst.limit, limit_angle=worst.limit_angle, decays=worst.decays
+        )
+    setting, plant = fault_map.setting, fault_map.driven(independent)
     block = plant.nx + plant.nf + plant.nd + plant.nw
     samples = min(setting.longest + MORE_SAMPLES, max(setting.longest, 1) + MOST_UNKNOWNS // block)
     best_points: list[complex] = []
