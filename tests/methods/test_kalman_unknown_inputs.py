@@ -158,3 +158,45 @@ def test_noise_along_an_unknown_input_leaves_no_variance_of_rounding(multiple: f
     Q = obsynth.descriptor_kalman(plant).observer.Q.at(0)
     assert np.linalg.matrix_rank(Q) == 1
     assert np.count_nonzero(np.diag(Q)) == 1
+
+
+@pytest.mark.parametrize("q", [None, 0.5])
+def test_where_no_equation_is_left_an_estimate_follows_from_the_outputs_of_its_sample(q: float | None) -> None:
+    rng = np.random.default_rng(6)
+    given = plant(rng, direct=0, nx=2, ny=3, nd=2)
+    design = obsynth.descriptor_kalman(given, Q=q)
+    assert design.report.passed
+    assert "no equation is left" in design.notes[0]
+    _, u, y = simulated(given, rng, 100.0 * rng.normal(size=(12, 2)))
+    found = design.observer.run(y, u)
+    np.testing.assert_allclose(found.states[-1], np.linalg.lstsq(given.C, y[-1], rcond=None)[0], rtol=1e-9)
+    covariance = 0.04 * np.linalg.inv(given.C.T @ given.C)
+    np.testing.assert_allclose(found.state_deviations[-1], np.sqrt(np.diag(covariance)), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("direct", "nd"), [(0, 1), (1, 1), (1, 2), (0, 2)])
+def test_the_adaptive_observer_learns_beside_any_unknown_input(direct: int, nd: int) -> None:
+    """Of records without noise the parameters are learned exactly, however large the unknown inputs are."""
+    rng = np.random.default_rng([7, direct, nd])
+    given = plant(rng, direct=direct, nd=nd, Bf=rng.normal(size=(4, 1)))
+    design = obsynth.adaptive_observer(given, forgetting=1.0, initial_parameter_covariance=1e6)
+    assert design.report.passed
+    d, theta = 100.0 * rng.normal(size=(80, nd)), 3.0
+    still = given.replace(
+        Bw=np.zeros((4, 1)), Dw=np.zeros((3, 1)), noise_names=None, B=np.hstack([given.B, given.Bf]),
+        D=np.zeros((3, 2)), input_names=["u1", "f1 as an input"], Bf=None, Df=None, fault_names=None,
+    )  # fmt: skip
+    x, y = np.zeros(4), []
+    u = rng.normal(size=(80, 1))
+    for k in range(80):
+        y.append(still.C @ x + still.Dd @ d[k])
+        x = still.A @ x + still.B @ [u[k, 0], theta] + still.Bd @ d[k]
+    found = design.observer.run(np.array(y), u)
+    assert found.parameters[-1, 0] == pytest.approx(theta, abs=1e-3)
+
+
+def test_a_parameter_that_an_unknown_input_can_imitate_is_named() -> None:
+    rng = np.random.default_rng(8)
+    given = plant(rng, direct=0, nd=1)
+    with pytest.raises(obsynth.PreconditionError, match="f1"):
+        obsynth.adaptive_observer(given.replace(Bf=given.Bd, Df=np.zeros((3, 1)), fault_names=["f1"]))

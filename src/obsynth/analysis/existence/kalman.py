@@ -7,6 +7,7 @@ With ``[V1 V2]`` orthonormal and ``Dd V2 = 0``, ``d1 = V1' d`` becomes a state w
     N [E \; 0] [x; d_1]^+ = N [A \; B_d V_1] [x; d_1] + N B u + N \mu, \qquad y = [C \; D_d V_1] [x; d_1] + \nu.
 
 Nothing else is known about d, so nothing is lost.  It exists when ``[N E 0; C Dd V1]`` has full column rank: (D1).
+Constant parameters of a plant (its faults) enter the equations that are left by ``N Bf``.
 """
 
 from __future__ import annotations
@@ -43,8 +44,15 @@ class WithoutUnknownInputs:
     scale: FloatArray  # of the prior deviations of d1, (n1,)
     note: str
 
+    @property
+    def outputs_alone(self) -> bool:
+        """Whether no equation is left: the estimate then follows from the outputs of its sample."""
+        return not self.equations.any()
+
     def process_covariance(self, covariance: object) -> object:
         """Return the covariance of the equations that are left, from that of all: a number or a constant matrix."""
+        if self.outputs_alone:
+            return np.zeros((1, 1))
         if np.ndim(covariance) == 0:  # type: ignore[arg-type]
             return covariance
         if callable(covariance) or np.ndim(covariance) != 2:  # type: ignore[arg-type]
@@ -99,7 +107,7 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     scaled = _scaled_inputs(plant)
     names, V1, V2 = _direct_inputs(plant, scaled)
     equations = _equations_without(plant, scaled, V2)
-    removed = plant.nx - len(equations)
+    removed = plant.nx - int(np.count_nonzero(equations.any(axis=1)))
     # All of them as states: in their own units again, with their own names.
     Bd, Dd = (plant.Bd, plant.Dd) if len(names) == plant.nd else (scaled.Bd, scaled.Dd)
     process_d1, direct_d1 = product_but_rounding(equations, Bd) @ V1, Dd @ V1
@@ -143,18 +151,14 @@ def _direct_inputs(plant: DescriptorSystem, scaled: _ScaledInputs) -> tuple[tupl
 
 
 def _equations_without(plant: DescriptorSystem, scaled: _ScaledInputs, V2: FloatArray) -> FloatArray:
-    """Return ``N`` with ``N Bd V2 = 0``: the equations that are left."""
+    """Return ``N`` with ``N Bd V2 = 0``: the equations that are left, or ``0 = 0`` where there are none."""
     # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
     hidden_effect = scaled.equations * scaled.Bd @ V2
     reached = np.flatnonzero(np.any(hidden_effect != 0.0, axis=1))
     left_vectors, singular_values, _ = np.linalg.svd(hidden_effect[reached])
     removed = numerical_rank(singular_values, scale=1.0)
     if removed == plant.nx:
-        raise SpecError(
-            f"Unknown inputs ({', '.join(plant.disturbance_names)}) drive every equation: none is left to predict the "
-            "state with. State one of them as noise (Bw), or leave it out.",
-            path="Bd",
-        )
+        return np.zeros((1, plant.nx))
     equations = np.eye(plant.nx)
     if not removed:
         return equations
@@ -168,7 +172,9 @@ def _note(plant: DescriptorSystem, names: Sequence[str], removed: int) -> str:
     parts = []
     if names:
         parts.append(f"{', '.join(map(repr, names))} {'is' if len(names) == 1 else 'are'} estimated with the states")
-    if removed:
+    if removed == plant.nx:
+        parts.append("no equation is left beside them, and each estimate follows from the outputs of its sample alone")
+    elif removed:
         parts.append(
             f"{removed} of {plant.nx} equations were removed with the unknown inputs that reach no output directly"
         )
@@ -177,16 +183,20 @@ def _note(plant: DescriptorSystem, names: Sequence[str], removed: int) -> str:
 
 
 def kalman_conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, early: bool = False
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    *,
+    parameters: bool = False,
+    literal: bool = False,
+    early: bool = False,
 ) -> tuple[Condition, ...]:
-    """Return the existence conditions; the list ends at the first failure."""
+    """Return the existence conditions, those of the ``parameters`` too; the list ends at the first failure."""
     if isinstance(plant, DescriptorSystem) and plant.nd:
         try:
             plant = without_unknown_inputs(plant).plant
         except SpecError:
             # What it is says why it is not taken.
             plant = plant.replace(Bd=None, Dd=None, disturbance_names=None)
-    return tuple(recursive_conditions(plant, parameters=False, early=early))
+    return tuple(recursive_conditions(plant, parameters=parameters, literal=literal, early=early))
 
 
 def with_stated_noise(

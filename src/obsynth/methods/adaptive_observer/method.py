@@ -28,7 +28,8 @@ class AdaptiveObserver(DescriptorKalman):
     ----------
     plant : TimeVaryingDescriptorSystem or DescriptorSystem
         ``E (ne, nx)``, ``C (ny, nx)``, ``Phi (ne, nq)``, ``Psi (ny, nq)``; the faults of a DescriptorSystem are taken
-        as parameters (it must be discrete in time, without disturbances).
+        as parameters (it must be discrete in time).  Nothing is assumed about its unknown inputs, which are treated
+        as by `descriptor_kalman`.
     Q, R : MatrixLike, optional
         As for `descriptor_kalman`.
     forgetting : float, optional, dimensionless
@@ -143,7 +144,6 @@ class AdaptiveObserver(DescriptorKalman):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.analysis.existence.recursive import recursive_conditions
+        from obsynth.analysis.existence.kalman import kalman_conditions
 
-        literal = self.form == "literal"
-        return tuple(recursive_conditions(plant, parameters=True, literal=literal, early=self.early_constraints))
+        return kalman_conditions(plant, parameters=True, literal=self.form == "literal", early=self.early_constraints)

@@ -32,9 +32,9 @@ class DescriptorKalman(Method):
         ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time.  What known inputs do to the
         outputs at once, ``D u``, is subtracted.  Its parameters are taken as zero.  Nothing is assumed about its
         unknown inputs: those that show in the outputs at once become states of the filter, and are estimated; the
-        equations that the others enter are left out.  Over the region of a PolytopicSystem a scheduled observer is
-        designed, with constant Q and R and no other option: its gains are steady at each vertex, and the mean square
-        of its errors is proved for every course of the parameters.
+        equations that the others enter are left out (all of them, where need be). Over the region of a PolytopicSystem
+        a scheduled observer is designed, with constant Q and R and no other option: its gains are steady at each
+        vertex, and the mean square of its errors is proved for every course of the parameters.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity

@@ -79,6 +79,9 @@ def _with_independent_noises(
         "initial_state": reduced.initial_state(options["initial_state"]),
         "initial_covariance": reduced.initial_covariance(options["initial_covariance"]),
     }
+    if reduced.outputs_alone:
+        missing = [name for name in missing if name != "Q"]
+        options["Q"] = 0.0
     if options["Q"] is not None:
         options["Q"] = reduced.process_covariance(options["Q"])
     synthesis = _of_varying(reduced.plant, options, missing=missing, own_units=far)
