@@ -479,3 +479,14 @@ def test_a_chain_that_is_sampled_fast_has_a_filter(
     design = obsynth.functional_filter(plant)
     assert design.report.passed
     assert design.certificate.claims["decay"] > 0.1 * (1.0 - pole)
+
+
+@pytest.mark.parametrize(("dt", "mode"), [(0.0, -40.0), (1.0, 1e-3)])
+def test_a_fast_state_that_no_output_shows_does_not_hurry_the_default(dt: float, mode: float) -> None:
+    """The time in which a step should be seen was that of all modes: the filter had up to 4.6 times the noise."""
+    own = 0.4 if dt else -1.0
+    noise = {"sensor_noise": {"y1": 0.1}, "dt": dt}
+    alone = obsynth.DescriptorSystem(A=[[own]], Bf=[[1.0]], C=[[1.0]], **noise)
+    beside = obsynth.DescriptorSystem(A=np.diag([own, mode]), Bf=[[1.0], [0.0]], C=[[1.0, 0.0]], **noise)
+    decays = [obsynth.functional_filter(plant).certificate.claims["decay"] for plant in (alone, beside)]
+    assert decays[1] == pytest.approx(decays[0], rel=0.01)

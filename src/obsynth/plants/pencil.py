@@ -6,8 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.pencils import PencilStructure, is_regular, reduced, structure_of_reduced, with_nonsingular_e
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
+from obsynth.numerics.pencils import (
+    PencilStructure,
+    finite_zeros,
+    is_regular,
+    reduced,
+    structure_of_reduced,
+    with_nonsingular_e,
+)
 from obsynth.numerics.staircase import Deflation, normal_rank_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -39,3 +46,15 @@ def structure_of(plant: DescriptorSystem) -> PencilStructure:
     structure = structure_of_reduced(plant.E.shape, _reduced(plant))
     values = PlantUnits.of(plant).rounded().eigenvalues(structure.finite_eigenvalues)
     return replace(structure, finite_eigenvalues=read_only(values, np.complex128))
+
+
+@remembered
+def shown_modes(plant: DescriptorSystem) -> ComplexArray:
+    """Return the finite modes of a plant without those that no output shows, such as that of a state beside it."""
+    units, (moving, whole) = PlantUnits.of(plant).rounded(), in_own_units(plant)
+    outputs = units.outputs[:, None] * plant.C * units.states
+    hidden = finite_zeros(np.vstack([moving, np.zeros_like(outputs)]), np.vstack([whole, outputs])).values
+    modes = structure_of(plant).finite_eigenvalues
+    for value in units.eigenvalues(hidden)[: len(modes)]:
+        modes = np.delete(modes, np.argmin(np.abs(modes - value)))
+    return read_only(modes, np.complex128)

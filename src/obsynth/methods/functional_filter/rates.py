@@ -28,7 +28,7 @@ from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem
-from obsynth.plants.pencil import structure_of
+from obsynth.plants.pencil import shown_modes, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.inequalities import slowest_decay
 
@@ -60,9 +60,10 @@ TRIED_LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
 
 
 def settling_time(plant: DescriptorSystem) -> float:
-    """Return the time in seconds after which a step of a fault should be seen."""
+    """Return the time in seconds after which a step of a fault should be seen, from the modes that the outputs show."""
     own = 1.0 / (plant.dt or PlantUnits.of(plant).time)
-    alive = np.sort(moving_speeds(structure_of(plant).finite_eigenvalues, plant.dt, own))
+    shown = shown_modes(plant)
+    alive = np.sort(moving_speeds(shown if shown.size else structure_of(plant).finite_eigenvalues, plant.dt, own))
     # The median, for which numpy would load its masked arrays.
     middle = 0.5 * (alive[(alive.size - 1) // 2] + alive[alive.size // 2]) if alive.size else 0.0
     seconds = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0

@@ -23,7 +23,7 @@ from obsynth.numerics.ranks import product_but_rounding
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem
-from obsynth.plants.pencil import structure_of
+from obsynth.plants.pencil import shown_modes, structure_of
 from obsynth.plants.plant_units import PlantUnits
 
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
@@ -145,7 +145,7 @@ def _own_rate(plant: DescriptorSystem, split: ObservableSplit) -> float:
     """Return the median speed of the modes that the outputs show; of the pair's where there are none; or its size."""
     size = largest_singular_value(split.F)
     # A plant's mode that no output shows is fixed: without fixed modes there is none.
-    shown = _shown_modes(plant) if split.fixed_modes.size else structure_of(plant).finite_eigenvalues
+    shown = shown_modes(plant) if split.fixed_modes.size else structure_of(plant).finite_eigenvalues
     for values in (shown, eigenvalues(split.F)):
         speeds = moving_speeds(values, plant.dt, 1.0 / plant.dt if plant.dt > 0.0 else 0.0)
         speeds = speeds[speeds > DEAD_BEAT]
@@ -153,15 +153,6 @@ def _own_rate(plant: DescriptorSystem, split: ObservableSplit) -> float:
             median = float(np.median(speeds))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
-
-
-def _shown_modes(plant: DescriptorSystem) -> ComplexArray:
-    """Return the finite modes of a plant without those that no output shows, such as that of a state beside it."""
-    modes = structure_of(plant).finite_eigenvalues
-    hidden = finite_zeros(np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])).values
-    for value in hidden[: len(modes)]:
-        modes = np.delete(modes, np.argmin(np.abs(modes - value)))
-    return modes
 
 
 def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> KalmanProblem:
