@@ -38,6 +38,8 @@ NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
         (TANK, "dae-adaptive-observer", {"dt": 1.0, "R": 1e-4}, "Q is missing"),
         (TANK, "dae-adaptive-observer", {"dt": 1.0, "Q": {"balance": 1e-4}}, "R is missing"),
         (BIASED, "dae-adaptive-observer", NOISE, "initial_parameter_covariance is missing"),
+        (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {"Q": np.eye(3)}, "Bw Dw' is not zero"),
+        (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "adaptive-observer", {"R": np.eye(2)}, "Bw Dw' is not zero"),
         (LINEAR.replace(Bd=np.eye(3), Dd=np.zeros((2, 3))), "descriptor-kalman", {}, "outputs do not determine"),
         (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {}, "free of noise"),
         (LINEAR.replace(dt=0.0, A=-LINEAR.A), "functional-filter", {"delay": 2}, "count samples"),
