@@ -115,13 +115,12 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
             _in_pairs(np.zeros(0, dtype=np.complex128)), sum(right_deflation.ranks) + columns, right_deflation.decisions
         )
     left_deflation = without_left_singular_part(right_deflation, scales)
-    computed, rank = _eigenvalues(left_deflation.E, left_deflation.A), normal_rank_of(right_deflation, left_deflation)
+    computed = _eigenvalues(left_deflation.E, left_deflation.A)
     decisions = right_deflation.decisions + left_deflation.decisions
+    # E has full column rank now, so the pencil has it at almost every point, whatever a long staircase makes of it.
+    rank = sum(right_deflation.ranks) + columns
     if np.all(clear):
-        return FiniteZeros(_in_pairs(computed[:0]), sum(right_deflation.ranks) + columns, decisions)
-    if rank < sum(right_deflation.ranks) + columns:
-        # Singular everywhere: that the pencil is so at a point says nothing.
-        return FiniteZeros(computed, rank, decisions)
+        return FiniteZeros(_in_pairs(computed[:0]), rank, decisions)
     points = PencilPoints(right_deflation.E, right_deflation.A, scales)
     # A staircase on the verge of a rank invents zeros at which the pencil is not singular.
     upper = [points.confirmed(complex(value)) for value in computed if value.imag >= 0.0]
