@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.analysis.existence import statements
 from obsynth.analysis.existence.filasova import pd_observer_conditions
 from obsynth.conditions import lmi
 from obsynth.methods.pd_observer import synthesis as pd_design
@@ -25,7 +26,9 @@ from obsynth.methods.pd_observer.certificate import (
 from obsynth.methods.pd_observer.certificate_proofs import error_inputs, prove_gains, prove_shipped_stability
 from obsynth.methods.pd_observer.limits import least_noise_gain
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import ContinuousNorms
+from obsynth.numerics.pencils import FiniteZeros
 from obsynth.simulation.linear import simulate_plant
 from obsynth.specs.loader import load_spec
 from obsynth.verification.inequalities import prove_gain, prove_symmetric_positive
@@ -606,3 +609,16 @@ def test_white_noise_in_a_constraint_is_named_where_outputs_would_differentiate_
     ):
         obsynth.pd_observer(plant)
     assert obsynth.pd_observer(plant.replace(Bw=None, Dw=None, noise_names=None)).report.passed
+
+
+def test_a_rank_that_e_itself_excludes_is_unclear_and_no_lost_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Of a network of 565 states over 40 decades a staircase made normal rank 564.
+    def one_short(E: FloatArray, A: FloatArray) -> FiniteZeros:
+        return FiniteZeros(np.zeros(0, dtype=np.complex128), E.shape[1] - 1, ())
+
+    monkeypatch.setattr(statements, "finite_zeros", one_short)
+    plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1.0, 0.0]], Bf=[[1.0], [0.0]])
+    last = pd_observer_conditions(plant, exactly=False)[-1]
+    assert not last.holds
+    assert last.unclear
+    assert "too many decades apart" in last.detail

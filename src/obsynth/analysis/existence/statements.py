@@ -368,6 +368,12 @@ class Evaluator:
         ``what`` would exist."""
         verdict = self.verdict(statement)
         facts, point = verdict.facts, verdict.point
+        if verdict.answer == "no" and not facts.outside and self._has_full_rank(statement):
+            detail = (
+                f"rank [A - s E; C] is {facts.normal_rank} of {facts.columns} in double precision at every s, though E is "
+                "the identity: entries of this plant are too many decades apart to decide."
+            )
+            return replace(holding(facts), holds=False, value=float(facts.normal_rank), detail=detail, unclear=True)
         if verdict.answer == "no":
             condition = lost(facts)
             gain = (
@@ -391,6 +397,10 @@ class Evaluator:
             condition = lost(replace(facts, outside=apparent))
             condition = replace(condition, detail=f"{detail} In floating point, {condition.detail}")
         return condition.in_doubt(self._zero_doubt(statement, point, verdict.least, what), self.plant)
+
+    def _has_full_rank(self, statement: NoZeroOutside) -> bool:
+        """Whether a pencil ``[A - s E; C]`` has full column rank at almost every point for its E."""
+        return not statement.inputs and np.array_equal(self.plant.E, np.eye(self.plant.nx))
 
     def _zero_doubt(self, statement: NoZeroOutside, point: complex, least: float, what: str) -> Unclear:
         """Return why it is unclear whether a pencil has a zero outside."""
