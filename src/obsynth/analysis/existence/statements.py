@@ -370,8 +370,8 @@ class Evaluator:
         facts, point = verdict.facts, verdict.point
         if verdict.answer == "no" and not facts.outside and self._has_full_rank(statement):
             detail = (
-                f"rank [A - s E; C] is {facts.normal_rank} of {facts.columns} in double precision at every s, though E is "
-                "the identity: entries of this plant are too many decades apart to decide."
+                f"rank [A - s E; C] is {facts.normal_rank} of {facts.columns} in double precision at every s, though "
+                "E is the identity: entries of this plant are too many decades apart to decide."
             )
             return replace(holding(facts), holds=False, value=float(facts.normal_rank), detail=detail, unclear=True)
         if verdict.answer == "no":
