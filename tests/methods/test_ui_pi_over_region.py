@@ -316,7 +316,9 @@ def slow() -> ObserverDesign:
 @pytest.mark.long
 def test_a_rate_buys_a_smaller_gain_in_continuous_time(slow: ObserverDesign) -> None:
     any_course = obsynth.ui_pi_observer(slow_plant(None))
-    assert slow.certificate.claims["region_gain"] < 0.95 * any_course.certificate.claims["region_gain"]
+    # At the same decay: with a slower one the gain could be .89 of one, in place of .94.
+    assert slow.certificate.claims["region_gain"] < 0.985 * any_course.certificate.claims["region_gain"]
+    assert slow.certificate.claims["region_decay"] >= any_course.certificate.claims["region_decay"]
     assert "changes by at most 0.1 in a second" in slow.report["gain over the region"].claim
     assert "every course of k" in slow.report["decay over the region"].claim
     # What it claims is no less than the gain at rest of any point.

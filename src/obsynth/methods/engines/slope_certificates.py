@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from obsynth.conditions.problem import Conditions
 from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
 from obsynth.errors import SolverError
-from obsynth.methods.engines.fastest_decay import faster, rate_within
+from obsynth.methods.engines.fastest_decay import faster, rate_within, slower_than
 from obsynth.methods.engines.vertex_certificates import (
     DECAY_ROOM,
     DECAY_SHARES,
@@ -155,7 +156,9 @@ def best_decay_of_slopes(
 
     start = solved(0.0, None)
     if start is not None:
-        for rate, problem in reversed(faster(solved, *start, discrete=False)):
+        reached = faster(solved, *start, discrete=False)
+        slower = () if gain is not None else slower_than(reached[-1][0], discrete=False)
+        for rate, problem in chain(filter(None, (solved(each, None) for each in slower)), reversed(reached)):
             L, witness = problem.gains()["L[1]"], _witness(problem, errors, factors, "decay", 1.0)
             for trial in (min(rate, limit) * (1.0 - share) for share in DECAY_SHARES):
                 if prove_decay(errors.closed(L), witness, trial, discrete=False).proved:

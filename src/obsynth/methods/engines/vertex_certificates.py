@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from obsynth.conditions.lmi import USABLE_STATUSES
 from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
-from obsynth.methods.engines.fastest_decay import faster, fastest_of
+from obsynth.methods.engines.fastest_decay import faster, fastest_of, slower_than
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
 from obsynth.numerics.ranks import decide_rank
@@ -385,7 +386,9 @@ def best_decay(
 
     start = solved(slowest if discrete else 0.0, None)
     if start is not None:
-        for rate, (inner, scaled) in reversed(faster(solved, *start, discrete=discrete)):
+        reached = faster(solved, *start, discrete=discrete)
+        slower = () if gains else slower_than(reached[-1][0], discrete=discrete)
+        for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in slower)), reversed(reached)):
             made = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
             witness = units.witness_out(inner, 1.0)
             for trial in _decays_to_try(min(rate, slowest if discrete else limit), slowest if discrete else None):
