@@ -40,8 +40,9 @@ MOST_RESCALINGS = 4
 NEGLIGIBLE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 #: Shares of the distance to one by which a decay is slower than the fastest at a level, whose P proves nothing.
 DECAY_MARGINS = (0.02, 0.1, 0.3)
-#: States times vertices above which a decay is that of the first P: an iteration takes more than a minute there.
-MOST_FAST = 128
+#: Cubed states times vertices, and vertices, above which a decay is that of the first P: an iteration takes some five
+#: seconds there (8 states with 8 vertices, 4 with 32), and twenty with 16 states and two.
+MOST_FAST, MOST_FAST_VERTICES = 4096, 32
 #: Steps by which a decay that is not proved is made slower, towards none.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
 #: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
@@ -286,7 +287,9 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
     That decay is a number of the plant, whatever its coordinates; the one that comes with the largest slack is not.
     """
     errors, units = search.errors, search.units
-    if errors.dt <= 0.0 or search.gains is not None or errors.ball or errors.order * errors.count > MOST_FAST:
+    if errors.dt <= 0.0 or search.gains is not None or errors.ball:
+        return first
+    if errors.order**3 * errors.count > MOST_FAST or errors.count > MOST_FAST_VERTICES:
         return first
     moved, steps, s = units.moved(z_unit), search.options["steps"], units.states / z_unit
     start = fastest_of(errors, first.gains, first.witness)
