@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ def monitor_of(name: str, kind: str) -> obsynth.types.Monitor | None:
         return None
     design = design_of(name)
     if kind == "learned":
-        return obsynth.online_monitor(design, "learned", normal=told(design))
+        # The fault shall alarm whatever the input does.
+        return obsynth.online_monitor(design, "learned", normal=replace(told(design), ranges=None))
     if name == "guaranteed":
         return obsynth.online_monitor(design)
     options = (
