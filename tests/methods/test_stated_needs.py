@@ -105,8 +105,9 @@ def test_a_filter_that_keeps_too_few_digits_is_not_said_to_not_exist() -> None:
         Dw=0.1 * np.eye(2),
         dt=1.0,
     )
-    assert ob.check(plant)["optimal-filter"].passed
-    with pytest.raises(ob.SolverError, match="inconclusive"):
+    # Kernels of some processors solve them, with too few digits: the others say that nothing is known.
+    assert all(row.unclear for row in ob.check(plant)["optimal-filter"].failures)
+    with pytest.raises((ob.SolverError, ob.PreconditionError), match=r"[Ii]nconclusive"):
         ob.optimal_filter(plant)
 
 

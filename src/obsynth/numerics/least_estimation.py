@@ -28,6 +28,12 @@ from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import reachable_basis, uncayley
 
+#: Least singular value of [A - z I; C] at a mode z, beside the norm of both, above which the outputs show that mode.
+SHOWN_SHARE = 1e-6
+
+#: Modes beyond are one over rounding: those of a problem that has lost its digits.
+FARTHEST_MODE = 1e12
+
 #: Why there is no filter.
 UNSTABLE_ZERO = (
     "The transfer from the faults to the outputs has a zero that is not strictly stable: no stable filter has this "
@@ -277,11 +283,30 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
         count = problem.B.shape[1]
         plain = replace(reduced, B=reduced.B[:, :count], D=reduced.D[:, :count], D1=D1[:, :count])
         return Whitened(reduced, plain, factor, K, basis, noise)
+    if _shows_lasting_modes(problem):
+        raise PreconditionError(
+            "Inconclusive: the outputs show every mode that lasts, or it is beyond double precision, but the Riccati "
+            f"equation of a filter with this fault map has no solution there ({reason}).",
+            condition="zeros",
+            unclear=True,
+        )
     raise PreconditionError(
         "The transfer from the faults to the outputs has a zero that is not strictly stable, or none of the "
         f"outputs shows a mode that lasts: no stable filter has this fault map ({reason}).",
         condition="zeros",
     )
+
+
+def _shows_lasting_modes(problem: EstimationProblem) -> bool:
+    """Return whether the outputs clearly show each mode on or outside the unit circle, so that (A, C) is detectable.
+
+    Those so far outside that double precision has no digits of them do not count.
+    """
+    n, whole = len(problem.A), np.vstack([problem.A, problem.C])
+    lasting = [value for value in np.linalg.eigvals(problem.A) if STABLE_RADIUS <= abs(value) < FARTHEST_MODE]
+    size = max(float(np.linalg.norm(whole)), SMALLEST)
+    unit = np.vstack([np.eye(n), np.zeros_like(problem.C)])
+    return all(np.linalg.svd(whole - value * unit, compute_uv=False)[-1] > SHOWN_SHARE * size for value in lasting)
 
 
 def _noisy(problem: EstimationProblem, noise: float) -> tuple[FloatArray, FloatArray]:

@@ -149,7 +149,7 @@ def conditions(plant: DescriptorSystem, options: Options) -> tuple[Condition, ..
     try:
         first_problem_or_driven(plant, options)
     except PreconditionError as error:
-        return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error))
+        return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error), unclear=error.unclear)
     second = Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
     if options.norm != "h2" or plant.is_discrete:
         return first, second
