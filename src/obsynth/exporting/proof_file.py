@@ -12,18 +12,18 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from flint import fmpz_mat
-from scipy.linalg import block_diag
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.exporting.proof_of_tests import test_claims
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.optimal_filter.certificate import gain_matrix
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.weights import Weights, weights_of
+from obsynth.methods.optimal_filter.reference import constant_gain, delayed, stored_reference
+from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
@@ -75,8 +75,6 @@ ESTIMATE_SHARE = 1e-3
 #: A fault map that no contraction is for is proved to the first of these shares of its size for constant faults that
 #: is: its P has a condition number of the square of what cancels.
 FAULT_MAP_LEVELS = (1e-5, 1e-4, 1e-3)
-
-ExactModel: TypeAlias = tuple[Dyadic, Dyadic, Dyadic, Dyadic]
 
 #: Matrices of the plant and of the observer that the file holds.
 _PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
@@ -295,7 +293,7 @@ class _Proof:
         # Its P is of the error in units of its own.  What is decoupled adds its rounding, and is no exception.
         decoupled = () if plain else tuple(options["decoupled"])
         seen = seen_plant(plant, decoupled)
-        matched = None if options["exact"] else _reference(certificate.matrices)
+        matched = None if options["exact"] else stored_reference(certificate.matrices)
         weights = weights_of(options.get("weights"), seen, rows=len(self.observer.Cz), exact=bool(options["exact"]))
         channel = ErrorChannel(replace(system.model, plant=seen), matched, weights).in_units_of(gain)
         signal = "disturbances and noise" if plant.nd else "noise"
@@ -305,7 +303,7 @@ class _Proof:
                 claim = system.gain_claim(signal, self._rows, level, p)
             else:
                 counted = [name for name in plant.disturbance_names if name not in decoupled]
-                claim = system.matching_claim(self._rows, level, p, disturbances=counted, matched=matched, of=weights)
+                claim = system.matching_claim(channel, self._rows, level, p, disturbances=counted)
             if claim is not None:
                 break
         self._add(f"the gain {gain:.6g} of this filter", claim)
@@ -317,17 +315,15 @@ class _Proof:
     def _fault_map_claim(self, system: _Exact) -> dict[str, Any] | None:
         """Return that the estimates differ from the reference model, or from the faults delayed, by next to nothing."""
         plant, observer, matrices = self.plant, self.observer, self.design.certificate.matrices
-        reference = _reference(matrices) or _delays(observer.fault_delays)
-        size = float(np.max(np.abs(reference[3] + reference[2] @ _at_rest(reference, plant.dt)), initial=0.0))
+        reference = stored_reference(matrices) or delayed(observer.fault_delays)
+        size = float(np.max(np.abs(constant_gain(reference, plant.dt)), initial=0.0))
         quiet = plant.replace(Bw=None, Dw=None, noise_names=None)
         channel = ErrorChannel(replace(system.model, plant=quiet), reference)
         for share in FAULT_MAP_LEVELS if size > 0.0 else ():
             scaled = channel.in_units_of(share * size)
             if (P := gain_matrix(channel, share * size, plant.dt, self._alpha)) is not None:
                 p = Dyadic.of(0.5 * (P + P.T)).scaled(scaled.unit).scaled(scaled.unit)
-                claim = system.matching_claim(
-                    self._rows, share * size, p, disturbances=[], matched=reference, noise=False
-                )
+                claim = system.matching_claim(channel, self._rows, share * size, p, disturbances=[])
                 if claim is not None:
                     return claim
         return None
@@ -378,31 +374,6 @@ def _mapped_at(observer: LinearObserver, dt: float) -> float:
     """Return where frequencies are mapped to the circle of samples, in continuous time: near those of the filter."""
     poles = np.abs(poles_of(observer))
     return float(np.exp(np.mean(np.log(poles[poles > 0.0])))) if dt == 0.0 and np.any(poles > 0.0) else 1.0
-
-
-def _reference(matrices: Mapping[str, FloatArray]) -> Model | None:
-    if "reference_A" not in matrices:
-        return None
-    a, b, c, d = (matrices[f"reference_{name}"] for name in "ABCD")
-    return a, b, c, d
-
-
-def _delays(delays: Sequence[int]) -> Model:
-    """Return the model of signals that are late by so many samples each."""
-    count = sum(delays)
-    a, b, c = np.eye(count, k=-1), np.zeros((count, len(delays))), np.zeros((len(delays), count))
-    first = 0
-    for i, late in enumerate(delays):
-        if late:
-            a[first, :] = 0.0
-            b[first, i] = c[i, first + late - 1] = 1.0
-            first += late
-    return a, b, c, np.diag([float(late == 0) for late in delays])
-
-
-def _at_rest(model: Model, dt: float) -> FloatArray:
-    a, b, _, _ = model
-    return np.asarray(np.linalg.solve((np.eye(len(a)) if dt > 0.0 else 0.0) - a, b), dtype=np.float64)
 
 
 def rows_of(observer: LinearObserver) -> list[tuple[str, str, int]]:
@@ -633,43 +604,20 @@ class _Exact:
         return None
 
     def matching_claim(
-        self,
-        kinds: list[str],
-        gamma: float,
-        p: Dyadic,
-        *,
-        disturbances: list[str],
-        matched: Model | None,
-        of: Weights | None = None,
-        noise: bool = True,
+        self, channel: ErrorChannel, kinds: list[str], gamma: float, p: Dyadic, *, disturbances: list[str]
     ) -> dict[str, Any] | None:
-        """Return the claim on the gain from weighted signals to a weighted error, from a reference model of faults."""
-        rows = [i for i, (kind, _, _) in enumerate(rows_of(self.observer)) if kind in kinds]
-        counted = [self.plant.disturbance_names.index(name) for name in disturbances]
-        into = [] if matched is None else [self.driven("faults")]
-        if counted:
-            b, d = self.driven("disturbances")
-            into.append((_rows(b.T, counted).T, _rows(d.T, counted).T))
-        into += [self.driven("noise")] if noise and self.plant.nw else []
-        if not into:
+        """Return the claim on the gain from weighted signals to a weighted error, from a reference model of faults;
+        ``disturbances`` are those that count as noise."""
+        formed: Any = replace(channel, unit=1.0)
+        a, b, c, d = formed(_ExactArithmetic)
+        if a.shape != p.shape or not b.shape[1]:
             return None
-        b, d = (blocks([list(each)]) for each in zip(*into, strict=True))
-        system: ExactModel = (self.az, b, -_rows(self.cz, rows), _rows(d, rows))
-        if matched is not None:
-            system = _beside(system, _exact_model(matched))
-        before = _input_weight(of, b.shape[1], self.plant.nf if matched is not None else 0)
-        behind = None if of is None else of.errors
-        if before is not None:
-            system = _in_series(_exact_model(before), system)
-        if behind is not None:
-            system = _in_series(system, _exact_model(behind))
-        if system[0].shape != p.shape:
-            return None
-        proved = self._bounded_real(*system, gamma, p)
+        proved = self._bounded_real(a, b, c, d, gamma, p)
         return None if proved is None else {
-            "claim": "matching", "rows": kinds, "faults": matched is not None, "disturbances": disturbances,
-            "noise": bool(noise and self.plant.nw), "reference": _model_data(matched),
-            "input_weight": _model_data(before), "error_weight": _model_data(behind), **proved,
+            "claim": "matching", "rows": kinds, "faults": channel.matched is not None, "disturbances": disturbances,
+            "noise": channel.model.plant.nw > len(disturbances), "reference": _model_data(channel.matched),
+            "input_weight": _model_data(channel.input_weight),
+            "error_weight": _model_data(channel.weights.errors if channel.weights else None), **proved,
         }  # fmt: skip
 
     def deviation_claim(self, kinds: list[str]) -> dict[str, Any] | None:
@@ -725,55 +673,22 @@ class _Contraction:
         return bounds
 
 
-def _beside(system: ExactModel, reference: ExactModel) -> ExactModel:
-    """Return the error from a reference model of the first inputs."""
-    (a, b, c, d), (ar, br, cr, dr) = system, reference
-    others = b.shape[1] - br.shape[1]
-    n, k = a.shape[0], ar.shape[0]
-    return (
-        blocks([[a, _zeros(n, k)], [_zeros(k, n), ar]]),
-        blocks([[b], [blocks([[br, _zeros(k, others)]])]]),
-        blocks([[c, -cr]]),
-        d - blocks([[dr, _zeros(d.shape[0], others)]]),
-    )
-
-
-def _in_series(first: ExactModel, second: ExactModel) -> ExactModel:
-    """Return ``second`` behind ``first``."""
-    (a1, b1, c1, d1), (a2, b2, c2, d2) = first, second
-    return (
-        blocks([[a1, _zeros(a1.shape[0], a2.shape[0])], [b2 @ c1, a2]]),
-        blocks([[b1], [b2 @ d1]]),
-        blocks([[d2 @ c1, c2]]),
-        d2 @ d1,
-    )
-
-
-def _input_weight(weights: Weights | None, count: int, faults: int) -> Model | None:
-    """Return the weight of all inputs, ``faults`` of which come first; ``None`` where nothing is weighted."""
-    if weights is None or (weights.noise is None and weights.faults is None):
-        return None
-    parts = [] if not faults else [weights.faults or _unweighted(faults)]
-    parts.append(weights.noise or _unweighted(count - faults))
-    a, b, c, d = (np.asarray(block_diag(*(part[i] for part in parts)), dtype=np.float64) for i in range(4))
-    return a, b, c, d
-
-
-def _unweighted(count: int) -> Model:
-    return np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)), np.eye(count)
-
-
-def _exact_model(model: Model) -> ExactModel:
-    a, b, c, d = (_exact(part) for part in model)
-    return a, b, c, d
-
-
 def _model_data(model: Model | None) -> dict[str, Any] | None:
     return None if model is None else {name: _shaped(part) for name, part in zip("ABCD", model, strict=True)}
 
 
-def _zeros(rows: int, columns: int) -> Dyadic:
-    return _exact(np.zeros((rows, columns)))
+class _ExactArithmetic:
+    """Dyadic numbers as an arithmetic in which an error channel is formed."""
+
+    @staticmethod
+    def exact(matrix: FloatArray) -> Dyadic:
+        """Return an array as it is."""
+        return _exact(matrix)
+
+    @staticmethod
+    def blocks(rows: Sequence[Sequence[Dyadic]]) -> Dyadic:
+        """Return a block matrix."""
+        return blocks(rows)
 
 
 def _exact(matrix: Any) -> Dyadic:

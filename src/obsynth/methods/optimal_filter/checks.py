@@ -16,9 +16,9 @@ from obsynth.methods.optimal_filter.fault_maps import (
     designed,
     least_deviation_of_every_start,
 )
+from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
-from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
@@ -79,7 +79,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield _fault_map(design, model)
         yield from _zeros(design, plant)
     weights = _claimed_map(design).weights
-    channel = ErrorChannel(model, None if options["exact"] else _reference(matrices), weights)
+    channel = ErrorChannel(model, None if options["exact"] else stored_reference(matrices), weights)
     if options["norm"] == "h2":
         yield _deviation(channel, claimed(claims, "deviation"), plant)
         yield _least_deviation(design, plant)
@@ -88,7 +88,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     level = claims["gain"] / channel.unit
     if "P" in matrices:
         proof, source = prove_norm(channel, matrices["P"], level, dt=plant.dt), "bounded real lemma"
-    elif not all(_decays(model, plant) for model in (_reference(matrices), *(weights or ())) if model is not None):
+    elif not all(
+        _decays(model, plant) for model in (stored_reference(matrices), *(weights or ())) if model is not None
+    ):
         # Of the filter's own states the row on its poles says so.
         proof = unproved("no decay is proved of the weights, or of the reference model")
         source = "eigenvalues of the Hamiltonian matrix"
@@ -126,7 +128,7 @@ def _fits(design: ObserverDesign) -> bool:
     if not {"T", "T0", "stability"} <= set(matrices) or not _options_fit(design):
         return False
     parts = (observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy, *matrices.values())
-    states, reference = matrices["T0"].shape[1], _reference(matrices)
+    states, reference = matrices["T0"].shape[1], stored_reference(matrices)
     extra = 0 if reference is None or options["exact"] else len(reference[0])
     try:
         weights = _claimed_map(design).weights
@@ -162,7 +164,7 @@ def _options_fit(design: ObserverDesign) -> bool:
     claims, matrices = design.certificate.claims, design.certificate.matrices
     if not {"norm", "exact", "delay", "reference", "decoupled"} <= set(options):
         return False
-    reference = _reference(matrices)
+    reference = stored_reference(matrices)
     late = observer.fault_delays
     if reference is None:
         timed = bool(late) and options["delay"] == plain_delays(late) and plant.nf == len(late)
@@ -204,20 +206,12 @@ def _decays(model: Model, plant: DescriptorSystem) -> bool:
     return not len(model[0]) or prove_contraction(model[0], discrete=plant.is_discrete) is not None
 
 
-def _reference(matrices: Mapping[str, FloatArray]) -> Model | None:
-    names = [f"reference_{name}" for name in "ABCD"]
-    if any(name not in matrices for name in names):
-        return None
-    a, b, c, d = (matrices[name] for name in names)
-    return a, b, c, d
-
-
 def _setting(design: ObserverDesign) -> Setting:
     return _claimed_map(design).setting
 
 
 def _claimed_map(design: ObserverDesign) -> FaultMap:
-    reference = _reference(design.certificate.matrices)
+    reference = stored_reference(design.certificate.matrices)
     delays = design.linear[1].fault_delays if reference is None else None
     exact, rows = bool(design.options["exact"]), len(design.linear[1].Cz)
     plant = seen_plant(design.linear[0], design.options["decoupled"])

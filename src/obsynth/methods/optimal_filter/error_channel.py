@@ -47,6 +47,17 @@ class ErrorChannel:
         return order + (0 if self.weights is None else self.weights.order)
 
     @property
+    def input_weight(self) -> Model | None:
+        """The weight of all that drives the error, faults first where they do; ``None`` where nothing is weighted."""
+        weights, plant = self.weights, self.model.plant
+        if weights is None or (weights.noise is None and weights.faults is None):
+            return None
+        inputs = [] if self.matched is None else [weights.faults or _identity(plant.nf)]
+        inputs.append(weights.noise or _identity(plant.nw))
+        a, b, c, d = (np.asarray(block_diag(*(part[i] for part in inputs)), dtype=np.float64) for i in range(4))
+        return a, b, c, d
+
+    @property
     def size(self) -> float:
         """What the noise could do to the error in a sample, whatever cancels."""
         model = self.model
@@ -88,13 +99,11 @@ class ErrorChannel:
         system, weights = self._unweighted(kind), self.weights
         if weights is None:
             return system
-        inputs = [weights.noise] if self.matched is None else [weights.faults, weights.noise]
-        counts = [self.model.plant.nw] if self.matched is None else [self.model.plant.nf, self.model.plant.nw]
-        parts = [_identity(count) if model is None else model for model, count in zip(inputs, counts, strict=True)]
-        before = tuple(np.asarray(block_diag(*(part[i] for part in parts)), dtype=np.float64) for i in range(4))
-        behind = _identity(len(self.model.observer.Cz)) if weights.errors is None else weights.errors
-        weighted = _in_series(kind, tuple(kind.exact(part) for part in before), system)
-        return _in_series(kind, weighted, tuple(kind.exact(part) for part in behind))
+        if (before := self.input_weight) is not None:
+            system = _in_series(kind, tuple(kind.exact(part) for part in before), system)
+        if weights.errors is not None:
+            system = _in_series(kind, system, tuple(kind.exact(part) for part in weights.errors))
+        return system
 
     def _unweighted(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         model, exact = self.model, kind.exact

@@ -186,15 +186,13 @@ class OptimalFilterMethod(Method):
     @classmethod
     def constant_fault_gain(cls, design: ObserverDesign, model: ErrorModel) -> FloatArray:
         """Return that of the reference model, else one; of model matching, which leaves an error, nothing is said."""
+        from obsynth.methods.optimal_filter.reference import constant_gain, stored_reference
+
         names = model.observer.fault_names
         if not design.options["exact"] or not set(names) <= set(model.plant.fault_names):
             return np.full((len(names), len(names)), np.nan)
-        matrices = design.certificate.matrices
-        if "reference_A" not in matrices:
-            return held_faults(model)
-        a, b, c, d = (matrices[f"reference_{name}"] for name in "ABCD")
-        still = np.eye(len(a)) * (model.plant.dt > 0.0)
-        return np.asarray(d + c @ np.linalg.solve(still - a, b))
+        reference = stored_reference(design.certificate.matrices)
+        return held_faults(model) if reference is None else constant_gain(reference, model.plant.dt)
 
 
 def _as_matrices(value: Any) -> Any:

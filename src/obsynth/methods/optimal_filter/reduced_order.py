@@ -17,6 +17,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     filter_in_plant_units,
     unit_of_errors,
 )
+from obsynth.methods.optimal_filter.reference import delayed
 from obsynth.methods.optimal_filter.weights import Weights, in_series
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.decoupling_windows import Channels, Model
@@ -97,7 +98,7 @@ def _fractions(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fr
     wanted = _wanted(plant, fault_map, each, full.alpha)
     # An index above one takes all inputs later.
     late = [delay + form.shift for delay in fault_map.delays or (0,) * plant.nf]
-    wanted = in_series(_chain(late), wanted) if any(late) else wanted
+    wanted = in_series(delayed(late), wanted) if any(late) else wanted
     # An index above one leaves samples of the inputs among the states, which are seen at once.
     own, spare = 0 if form.shift else len(form.A), form.shift + max(late, default=0)
     rows, ends = len(wanted[3]), _must_end(plant, norm)
@@ -140,13 +141,6 @@ def _with_every_state(
     ends = np.cumsum([part.shape[1] for part in parts])
     b, d = (tuple(np.split(part, ends, axis=1)[:3]) for part in (form.B, form.D))
     return form, b, d
-
-
-def _chain(delays: list[int]) -> Model:
-    """Return delays of signals as a model."""
-    chains = [(np.eye(late, k=-1), np.eye(late, 1), np.eye(1, late, k=late - 1)) for late in delays]
-    a, b, c = (np.asarray(block_diag(*(chain[i] for chain in chains)), dtype=np.float64) for i in range(3))
-    return a, b, c, np.diag([float(late == 0) for late in delays])
 
 
 def _wanted(plant: DescriptorSystem, fault_map: FaultMap, each: FloatArray, alpha: float) -> Model:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import SpecError
@@ -99,3 +100,25 @@ def _of_control(model: Any, plant: DescriptorSystem, what: str, path: str) -> Mo
     if bool(system.dt) != plant.is_discrete or (plant.is_discrete and system.dt not in (True, plant.dt)):
         raise SpecError(f"The {what} has dt = {system.dt}, the plant {plant.dt:g}: give both the same.", path=path)
     return _shaped([system.A, system.B, system.C, system.D], what, path)
+
+
+def delayed(delays: Sequence[int]) -> Model:
+    """Return the model of signals that are late by so many samples each."""
+    chains = [(np.eye(late, k=-1), np.eye(late, 1), np.eye(1, late, k=late - 1)) for late in delays]
+    a, b, c = (np.asarray(block_diag(*(chain[i] for chain in chains)), dtype=np.float64) for i in range(3))
+    return a, b, c, np.diag([float(late == 0) for late in delays])
+
+
+def stored_reference(matrices: Mapping[str, FloatArray]) -> Model | None:
+    """Return the reference model that the matrices of a certificate hold; ``None`` where they hold none."""
+    names = [f"reference_{name}" for name in "ABCD"]
+    if any(name not in matrices for name in names):
+        return None
+    a, b, c, d = (matrices[name] for name in names)
+    return a, b, c, d
+
+
+def constant_gain(model: Model, dt: float) -> FloatArray:
+    """Return what a model makes of constant signals in the end."""
+    a, b, c, d = model
+    return np.asarray(d + c @ np.linalg.solve(np.eye(len(a)) * (dt > 0.0) - a, b))
