@@ -131,9 +131,7 @@ def slope_inequality(
     >>> bool(conditions.variables["room"].value > 1e-3)
     True
     """
-    _require_options(errors, goal, multiplier, decay)
-    if decay_metric is not None and goal != "decay":
-        raise SpecError("A metric of the decay is for goal 'decay': leave it out.", path="decay_metric")
+    _require_options(errors, goal, multiplier, decay, decay_metric)
     own = errors.nominal
     n, k, m, p = own.order, own.differential or own.order, own.outputs, own.inputs
     P, G = descriptor_variables(n, k)
@@ -147,31 +145,22 @@ def slope_inequality(
     slack: Any = margin if room is None or decay_metric is not None else room
     name = "gamma_squared" if goal == "gain" else "mean_square"
     squared: Any = cp.Variable(nonneg=True, name=name) if level is None else level**2
-    multipliers: dict[str, Any] = {}
-    constraints: dict[str, Any] = {"P": lmi.at_least(P[:k, :k], slack)}
-    GA, GW = G.T @ own.A[0] - Y @ own.C[0], G.T @ errors.W - Y @ errors.Wy
     GB, Z = G.T @ own.B[0] - Y @ own.D[0], own.Cz[0]
-
-    def with_multiplier(name: str, first: Any, *, driven: bool) -> None:
-        Q, S, R, more = _multiplier(errors.count, multiplier, name)
-        constraints.update(more)
-        if multiplier == "diagonal":
-            multipliers[f"T[{name}]"] = -R
-        lower = [[-(2.0 * GA + first + errors.V.T @ Q @ errors.V)], [-(GW + errors.V.T @ S).T, -R]]
-        if driven:
-            lower.append([-GB.T, np.zeros((p, errors.count)), squared * np.eye(p)])
-        constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
-
+    collected = _Inequalities(
+        errors, multiplier, slack, squared, G.T @ own.A[0] - Y @ own.C[0], G.T @ errors.W - Y @ errors.Wy, GB, {}, {}
+    )
+    constraints = collected.constraints
+    constraints["P"] = lmi.at_least(P[:k, :k], slack)
     if goal == "gain":
-        with_multiplier("gain", Z.T @ Z, driven=True)
+        collected.add("gain", Z.T @ Z, driven=True)
     if goal == "power":
-        with_multiplier("power", Z.T @ Z, driven=False)
+        collected.add("power", Z.T @ Z, driven=False)
         noise = cp.Variable((p, p), symmetric=True)
         constraints["trace"] = cp.trace(noise) + slack <= squared
         constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
     if decay is not None:
         beside = 0.0 if decay_metric is None or room is None else 2.0 * room * np.asarray(decay_metric)
-        with_multiplier("decay", 2.0 * decay * P + beside, driven=False)
+        collected.add("decay", 2.0 * decay * P + beside, driven=False)
     most = MOST_ROOM if decay_metric is None else MOST_DECAY_ROOM
     constraints |= _limits(goal, P, (room, most), Y1, gain_limit if given is None else None)
     objective = cp.Minimize(squared) if room is None else cp.Maximize(room)
@@ -180,8 +169,7 @@ def slope_inequality(
 
     def gains(_: Values) -> dict[str, FloatArray]:
         L = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value)) if given is None else given
-        values = {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)}
-        return values | {each: np.diag(np.asarray(T.value)) for each, T in multipliers.items()}
+        return {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)} | collected.multiplier_values()
 
     return Conditions(
         f"one inequality with a {multiplier} multiplier",
@@ -194,6 +182,37 @@ def slope_inequality(
         gains,
         _no_design,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Inequalities:
+    """The inequalities with multipliers, as they are collected: each with multipliers of its own."""
+
+    errors: SlopedErrors
+    kind: str
+    slack: Any
+    squared: Any
+    GA: Any
+    GW: Any
+    GB: Any
+    constraints: dict[str, Any]
+    multipliers: dict[str, Any]
+
+    def add(self, name: str, first: Any, *, driven: bool) -> None:
+        """Add the inequality with ``first`` beside the states, and with the inputs where it is ``driven``."""
+        errors, p = self.errors, self.errors.nominal.inputs
+        Q, S, R, more = _multiplier(errors.count, self.kind, name)
+        self.constraints.update(more)
+        if self.kind == "diagonal":
+            self.multipliers[f"T[{name}]"] = -R
+        lower = [[-(2.0 * self.GA + first + errors.V.T @ Q @ errors.V)], [-(self.GW + errors.V.T @ S).T, -R]]
+        if driven:
+            lower.append([-self.GB.T, np.zeros((p, errors.count)), self.squared * np.eye(p)])
+        self.constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), self.slack)
+
+    def multiplier_values(self) -> dict[str, FloatArray]:
+        """Return the diagonal multipliers of a solution."""
+        return {name: np.diag(np.asarray(T.value)) for name, T in self.multipliers.items()}
 
 
 def _no_design(_: dict[str, FloatArray], name: str) -> ObserverDesign:
@@ -213,7 +232,9 @@ def _limits(goal: str, P: Any, slack: tuple[Any, float], Y: Any, gain_limit: flo
     return limits
 
 
-def _require_options(errors: SlopedErrors, goal: str, multiplier: str, decay: float | None) -> None:
+def _require_options(
+    errors: SlopedErrors, goal: str, multiplier: str, decay: float | None, decay_metric: FloatArray | None
+) -> None:
     chosen(goal, "goal", ("gain", "power", "decay"))
     chosen(multiplier, "multiplier", ("full", "diagonal"))
     if multiplier == "full" and errors.count > MOST_IN_FULL_MULTIPLIER:
@@ -226,6 +247,8 @@ def _require_options(errors: SlopedErrors, goal: str, multiplier: str, decay: fl
         raise SpecError(f"decay is {shown(decay)}: give a rate, 0 or more.", path="decay")
     if goal == "decay" and decay is None:
         raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
+    if decay_metric is not None and goal != "decay":
+        raise SpecError("A metric of the decay is for goal 'decay': leave it out.", path="decay_metric")
 
 
 def _multiplier(q: int, kind: str, name: str) -> tuple[Any, Any, Any, dict[str, Any]]:

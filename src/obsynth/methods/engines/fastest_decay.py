@@ -110,9 +110,11 @@ def faster(
     return reached
 
 
-def slower_than(fastest: float, *, discrete: bool) -> tuple[float, ...]:
-    """Return decays at which gains are sought, of which the first that is proved ships."""
-    return tuple(fastest + share * (1.0 - fastest) if discrete else fastest * (1.0 - share) for share in MARGINS)
+def slower(fastest: float, shares: Sequence[float], slowest: float | None) -> list[float]:
+    """Return decays that are slower by shares of the way to ``slowest``, a factor; to none where that is ``None``."""
+    if slowest is None:
+        return [fastest * (1.0 - share) for share in shares]
+    return [fastest + share * (slowest - fastest) for share in shares]
 
 
 def _mean(parts: Sequence[FloatArray], weights: FloatArray) -> FloatArray:

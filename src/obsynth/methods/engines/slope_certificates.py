@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.conditions.problem import Conditions
 from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
 from obsynth.errors import SolverError
-from obsynth.methods.engines.fastest_decay import faster, rate_within, slower_than
+from obsynth.methods.engines.fastest_decay import MARGINS, faster, rate_within, slower
 from obsynth.methods.engines.vertex_certificates import (
     DECAY_ROOM,
     DECAY_SHARES,
@@ -157,10 +157,10 @@ def best_decay_of_slopes(
     start = solved(0.0, None)
     if start is not None:
         reached = faster(solved, *start, discrete=False)
-        slower = () if gain is not None else slower_than(reached[-1][0], discrete=False)
-        for rate, problem in chain(filter(None, (solved(each, None) for each in slower)), reversed(reached)):
+        near = () if gain is not None else slower(reached[-1][0], MARGINS, None)
+        for rate, problem in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             L, witness = problem.gains()["L[1]"], _witness(problem, errors, factors, "decay", 1.0)
-            for trial in (min(rate, limit) * (1.0 - share) for share in DECAY_SHARES):
+            for trial in slower(min(rate, limit), DECAY_SHARES, None):
                 if prove_decay(errors.closed(L), witness, trial, discrete=False).proved:
                     return trial, witness, L
     raise SolverError(f"No certificate of stability for the slopes was found. {_INCONCLUSIVE}")

@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.conditions.lmi import USABLE_STATUSES
 from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
-from obsynth.methods.engines.fastest_decay import faster, fastest_of, slower_than
+from obsynth.methods.engines.fastest_decay import MARGINS, faster, fastest_of, slower
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
 from obsynth.numerics.ranks import decide_rank
@@ -133,8 +133,7 @@ def certified(
     search = _Search(
         errors,
         ErrorUnits.of(errors),
-        {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain}
-        | ({"free_output": True} if free_output else {}),
+        {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain, "free_output": free_output},
         gains,
         solver,
         settings,
@@ -307,8 +306,8 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
         return None if reached is None else (reached, list(witness.P))
 
     fastest, _ = faster(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)[-1]
-    for margin in DECAY_MARGINS:
-        made = search.at(first.level, z_unit, fastest + margin * (1.0 - fastest), first.least)
+    for decay in slower(fastest, DECAY_MARGINS, 1.0):
+        made = search.at(first.level, z_unit, decay, first.least)
         if made is not None:
             return made
     return replace(first, runs=tuple(search.runs))
@@ -390,24 +389,18 @@ def best_decay(
     start = solved(slowest if discrete else 0.0, None)
     if start is not None:
         reached = faster(solved, *start, discrete=discrete)
-        slower = () if gains else slower_than(reached[-1][0], discrete=discrete)
-        for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in slower)), reversed(reached)):
+        near = () if gains else slower(reached[-1][0], MARGINS, 1.0 if discrete else None)
+        for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             made = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
             witness = units.witness_out(inner, 1.0)
-            for trial in _decays_to_try(min(rate, slowest if discrete else limit), slowest if discrete else None):
+            fastest, end = (min(rate, slowest), slowest) if discrete else (min(rate, limit), None)
+            for trial in slower(fastest, DECAY_SHARES, end):
                 if prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved:
                     return trial, witness, made
     raise SolverError(
         "No certificate of stability at the vertices was found. That is no proof that there is none: give "
         f"{_remedy(errors)}."
     )
-
-
-def _decays_to_try(fastest: float, slowest: float | None) -> list[float]:
-    """Return decays from the fastest on, to ``slowest`` in discrete time and to none in continuous time."""
-    if slowest is None:
-        return [fastest * (1.0 - share) for share in DECAY_SHARES]
-    return [fastest + share * (slowest - fastest) for share in DECAY_SHARES]
 
 
 def proved_decay(
@@ -420,7 +413,7 @@ def proved_decay(
         fastest = 0.0
     fastest = min(fastest, 1.0) if discrete else fastest
     tries = [] if required is None else [required]
-    tries += _decays_to_try(fastest, 1.0 if discrete else None)
+    tries += slower(fastest, DECAY_SHARES, 1.0 if discrete else None)
     for rate in tries:
         if prove_decay(vertices, witness, rate, discrete=discrete, ball=errors.ball).proved:
             return rate
