@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.first_states import extended_covariance, extended_mean, stated_covariance
 from obsynth.analysis.existence.recursive import recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
@@ -68,22 +69,15 @@ class WithoutUnknownInputs:
         factor = product_but_rounding(self.equations, covariance_factor(matrix, "Q"))
         return factor @ factor.T
 
-    def initial_state(self, state: object) -> object:
+    def initial_state(self, state: object) -> FloatArray:
         """Return the mean of the first state: unknown inputs are as likely to be of either sign."""
-        mean = np.zeros(self.equations.shape[1]) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
-        return np.concatenate([mean, np.zeros(len(self.names))])
+        return extended_mean(state, self.equations.shape[1], len(self.names))
 
-    def initial_covariance(self, covariance: object) -> object:
+    def initial_covariance(self, covariance: object) -> FloatArray:
         """Return the covariance of the first state, in which unknown inputs may have any size."""
-        count = self.equations.shape[1]
-        own = np.eye(count) if covariance is None else as_matrix(covariance, "initial_covariance")
-        own = own[0, 0] * np.eye(count) if own.shape == (1, 1) else own
-        require_shape(own.shape, (count, count), "initial_covariance")
-        joint = np.zeros((count + len(self.names),) * 2)
-        joint[:count, :count] = own
+        own = stated_covariance(covariance, self.equations.shape[1])
         deviation = UNKNOWN_INPUT_PRIOR * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)
-        joint[count:, count:] = np.diag(deviation**2)
-        return joint
+        return extended_covariance(own, deviation**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, remembered
+from obsynth.analysis.existence.first_states import extended_covariance, extended_mean, stated_covariance
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -41,16 +41,11 @@ class SharedNoise:
 
     def initial_state(self, state: Any) -> FloatArray:
         """Return the mean of the first state: that of the noise is zero."""
-        mean = np.zeros(self.written) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
-        require_shape(mean.shape, (self.written,), "initial_state")
-        return np.concatenate([mean, np.zeros(len(self.names))])
+        return extended_mean(state, self.written, len(self.names))
 
     def initial_covariance(self, covariance: Any) -> FloatArray:
         """Return the covariance of the first state: that of the noise is the identity at every sample."""
-        own = np.eye(self.written) if covariance is None else as_matrix(covariance, "initial_covariance")
-        own = own[0, 0] * np.eye(self.written) if own.shape == (1, 1) else own
-        require_shape(own.shape, (self.written, self.written), "initial_covariance")
-        return np.asarray(block_diag(own, np.eye(len(self.names))))
+        return extended_covariance(stated_covariance(covariance, self.written), np.ones(len(self.names)))
 
 
 def shared_noise(plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, Q: Any, R: Any) -> SharedNoise | None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
-from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
+from obsynth.analysis.existence.kalman import WithoutUnknownInputs, with_stated_noise, without_unknown_inputs
 from obsynth.analysis.existence.recursive import detectability_condition
-from obsynth.analysis.existence.shared_noise import shared_noise
+from obsynth.analysis.existence.shared_noise import SharedNoise, shared_noise
 from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
 from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
@@ -49,10 +49,7 @@ def synthesise(
     units = PlantUnits.of(plant)
     if options["initial_covariance"] is None and units.spread > FAR_UNITS:
         options["initial_covariance"] = np.diag(units.rounded().states ** 2)
-    options |= {
-        "initial_state": shared.initial_state(options["initial_state"]),
-        "initial_covariance": shared.initial_covariance(options["initial_covariance"]),
-    }
+    options |= _of_first_state(shared, options)
     synthesis = _with_independent_noises(shared.plant, options, progress=progress)
     return replace(synthesis, notes=(shared.note, *synthesis.notes))
 
@@ -75,10 +72,7 @@ def _with_independent_noises(
     if not isinstance(plant, DescriptorSystem) or not plant.nd:
         return _of_varying(as_time_varying(plant), options, missing=missing, own_units=far)
     reduced = without_unknown_inputs(plant)
-    options |= {
-        "initial_state": reduced.initial_state(options["initial_state"]),
-        "initial_covariance": reduced.initial_covariance(options["initial_covariance"]),
-    }
+    options |= _of_first_state(reduced, options)
     if reduced.outputs_alone:
         missing = [name for name in missing if name != "Q"]
         options["Q"] = 0.0
@@ -86,6 +80,14 @@ def _with_independent_noises(
         options["Q"] = reduced.process_covariance(options["Q"])
     synthesis = _of_varying(reduced.plant, options, missing=missing, own_units=far)
     return replace(synthesis, notes=(reduced.note, *synthesis.notes))
+
+
+def _of_first_state(extended: SharedNoise | WithoutUnknownInputs, options: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return what is stated of the first state for a plant that has more states than are written."""
+    return {
+        "initial_state": extended.initial_state(options["initial_state"]),
+        "initial_covariance": extended.initial_covariance(options["initial_covariance"]),
+    }
 
 
 def _of_varying(
