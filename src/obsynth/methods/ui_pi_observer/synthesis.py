@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -170,38 +170,50 @@ def _without_likeness(
     near = nearly_merged_outputs(known.plant)
     if near is None:
         return merged, None
-    costs, results = list[tuple[float, float]](), list[tuple[PlacementProblem, Choice] | None]()
-    for choice in (merged, near):
-        results.append(None)
-        try:
-            problem = placement_problem(
-                known.plant if choice is None else choice.plant,
-                model,
-                known.fixed_modes,
-                joint=method.joint,
-                paper_matrices=None,
-            )
-            chosen = _chosen(method, problem, None, weights, known.plant.dt)
-        except (ObsynthError, np.linalg.LinAlgError):
-            costs.append((np.inf, np.inf))
-            continue
-        results[-1] = problem, chosen
-        U, D, K = problem.gains(chosen[0])
-        means = np.eye(known.plant.ny) if choice is None else choice.weights
-        observer = assembled(
-            known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint
-        ).linear_observer
-        poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
-        settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
-        costs.append((fault_deviation(known.plant, observer), settling))
-    (noise, settling), (near_noise, near_settling) = costs
+    own, other = (_compared(known, model, method, choice, weights) for choice in (merged, near))
+    if other is None:
+        return merged, own and own.result
+    if own is None:
+        return near, other.result
     if method.poles is not None:
-        takes_near = near_noise <= AS_FAST * noise
+        takes_near = other.noise <= AS_FAST * own.noise
     else:
-        quieter = near_noise * AS_FAST < noise and near_settling < FAR_SLOWER * settling
-        takes_near = near_settling <= AS_FAST * settling or quieter
-    takes_near = takes_near and bool(np.isfinite(near_settling))
-    return (near, results[1]) if takes_near else (merged, results[0])
+        quieter = other.noise * AS_FAST < own.noise and other.settling < FAR_SLOWER * own.settling
+        takes_near = other.settling <= AS_FAST * own.settling or quieter
+    return (near, other.result) if takes_near else (merged, own.result)
+
+
+class _Compared(NamedTuple):
+    """A choice of outputs to merge: deviation of the faults, settling time, and the problem with its gain."""
+
+    noise: float
+    settling: float
+    result: tuple[PlacementProblem, Choice]
+
+
+def _compared(
+    known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+) -> _Compared | None:
+    """Return what a choice of outputs to merge comes to; ``None`` where it has no gain."""
+    try:
+        problem = placement_problem(
+            known.plant if merged is None else merged.plant,
+            model,
+            known.fixed_modes,
+            joint=method.joint,
+            paper_matrices=None,
+        )
+        chosen = _chosen(method, problem, None, weights, known.plant.dt)
+    except (ObsynthError, np.linalg.LinAlgError):
+        return None
+    U, D, K = problem.gains(chosen[0])
+    means = np.eye(known.plant.ny) if merged is None else merged.weights
+    observer = assembled(
+        known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint
+    ).linear_observer
+    poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
+    settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
+    return _Compared(fault_deviation(known.plant, observer), settling, (problem, chosen))
 
 
 def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str) -> Choice:
