@@ -33,6 +33,22 @@ GOALS = ("power", "gain", "decay")
 def case(seed: int) -> Outcome:
     """Design over a region, and look for a trajectory that exceeds what is proved."""
     rng, goal = np.random.default_rng(seed), GOALS[seed % len(GOALS)]
+    made = designed(rng, goal)
+    if isinstance(made, Outcome):
+        return made
+    design, region, noise = made
+    wrong, share = _decay(design, rng)
+    if goal != "decay":
+        more, share = _frozen(design, goal, noise, rng)
+        wrong = wrong or more
+    wrong = wrong or _left(design, region)
+    return Outcome(goal, "above 0.9 of the claim" if share > 0.9 else "below 0.9 of the claim", wrong, share)
+
+
+def designed(
+    rng: np.random.Generator, goal: str
+) -> tuple[obsynth.ObserverDesign, dict[str, list[float]], dict[str, float]] | Outcome:
+    """Return a design for a random plant with its region and noise; the outcome where there is none."""
     model, region = _plant(rng)
     noise = {name: 1e-2 for name in (*model.output_names, "fault")} | {"der(x1)": 3e-2}
     step = float(rng.choice([0.02, 0.1, 0.5]))
@@ -41,12 +57,7 @@ def case(seed: int) -> Outcome:
         design = obsynth.region_observer(model, region=region, sample_time=step, goal=goal, **options)
     except (SolverError, PreconditionError) as error:
         return Outcome(goal, f"{type(error).__name__}")
-    wrong, share = _decay(design, rng)
-    if goal != "decay":
-        more, share = _frozen(design, goal, noise, rng)
-        wrong = wrong or more
-    wrong = wrong or _left(design, region)
-    return Outcome(goal, "above 0.9 of the claim" if share > 0.9 else "below 0.9 of the claim", wrong, share)
+    return design, region, noise
 
 
 def _plant(rng: np.random.Generator) -> tuple[obsynth.DAEModel, dict[str, list[float]]]:

@@ -14,13 +14,13 @@ import itertools
 
 import numpy as np
 from benchmarks.campaigns.frame import Outcome
-from benchmarks.campaigns.nonlinear_regions import GOALS, ROUNDING, _plant, _size
+from benchmarks.campaigns.nonlinear_regions import GOALS, ROUNDING, _size, designed
 from benchmarks.campaigns.switched_regions import BISECTIONS, Closed, _exceeded_in_pieces
 from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 import obsynth
-from obsynth.errors import PreconditionError, SolverError
+from obsynth.errors import SolverError
 from obsynth.plants.operating_region import OperatingRegion
 from obsynth.plants.transformations.nonlinear_terms import nonlinear_terms
 from obsynth.verification.nonlinear_drive import drive_of, wanted_of
@@ -42,14 +42,10 @@ PULSES = 4
 def case(seed: int) -> Outcome:
     """Design over a region, and look for what exceeds what is proved."""
     rng, goal = np.random.default_rng(FRESH + seed), GOALS[seed % len(GOALS)]
-    model, region = _plant(rng)
-    noise = {name: 1e-2 for name in (*model.output_names, "fault")} | {"der(x1)": 3e-2}
-    step = float(rng.choice([0.02, 0.1, 0.5]))
-    options = {} if goal == "decay" else {"noise": noise}
-    try:
-        design = obsynth.region_observer(model, region=region, sample_time=step, goal=goal, **options)
-    except (SolverError, PreconditionError) as error:
-        return Outcome(goal, f"{type(error).__name__}")
+    made = designed(rng, goal)
+    if isinstance(made, Outcome):
+        return made
+    design, region, noise = made
     wrong, share = _least_shrunk(design, rng)
     if goal != "decay":
         claim = design.certificate.claims["region_deviation" if goal == "power" else "region_gain"]
