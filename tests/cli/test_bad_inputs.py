@@ -180,7 +180,7 @@ SCHEMA = [
     Case(
         "unknown method",
         put("method", "id", "kalman"),
-        "the known methods are: adaptive-observer, auto, dae-adaptive-observer",
+        "There are: adaptive-observer, auto, dae-adaptive-observer",
     ),
     Case("dt negative", put("plant", "dt", -0.1), "plant.dt: must be at least 0"),
     Case("dt as text", put("plant", "dt", "1.0"), "plant.dt: must be a number, not the text '1.0'"),

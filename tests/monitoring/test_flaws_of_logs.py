@@ -271,7 +271,7 @@ def test_a_bound_of_the_noise_needs_noise_that_is_stated() -> None:
 
 def test_powers_of_matrices_whose_entries_cancel_are_those_of_their_eigenvalues() -> None:
     from obsynth.monitoring.thresholds.residual_model import schur_form
-    from obsynth.monitoring.thresholds.stated_noise import samples_of
+    from obsynth.monitoring.thresholds.residual_norm_bounds import samples_of
 
     turned = np.array([[1.0, 1e7], [0.0, 1.0]])
     matrix = turned @ np.diag([0.5, 0.4]) @ np.linalg.inv(turned)

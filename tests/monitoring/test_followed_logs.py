@@ -164,7 +164,7 @@ def test_what_has_no_end_is_refused_where_an_end_is_needed(
 
 
 def test_a_health_line_is_said_of_a_log_that_grows(capsys: pytest.CaptureFixture[str]) -> None:
-    from obsynth.monitoring.verbs.data_arguments import health
+    from obsynth.monitoring.verbs.run_progress import health
 
     said = health()
     said(1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from obsynth.monitoring.thresholds.stated_noise import ScaledInputs, pointwise_threshold, unlimited_bound
+from obsynth.monitoring.thresholds.residual_norm_bounds import ScaledInputs, pointwise_threshold, unlimited_bound
 
 
 @dataclass

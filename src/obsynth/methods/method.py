@@ -134,7 +134,7 @@ class Method(ABC):
             known = sorted(field_types(cls))
             near = suggestion(unknown[0], known) if len(unknown) == 1 else ""
             raise SpecError(
-                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(known)}.{near}",
+                f"{cls.id} has no option {', '.join(map(repr, unknown))}.{near} There are: {', '.join(known)}.",
                 path=OPTIONS_PATH,
             )
         return cls(**{name: without_axes(value) for name, value in options.items()})

@@ -44,9 +44,10 @@ __all__ = [
 def method_class(method: str) -> type[Method]:
     """Return the class of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
+        plug_in = f" If a plug-in has it, install the package that provides {method}."
         raise SpecError(
-            f"There is no method {method!r}; there are: {', '.join(REGISTRY)}."
-            f"{suggestion(method, REGISTRY) or f' If a plug-in has it, install the package that provides {method}.'}",
+            f"There is no method {method!r}.{suggestion(method, REGISTRY) or plug_in} "
+            f"There are: {', '.join(REGISTRY)}.",
             path="method",
         )
     module, _, name = REGISTRY[method].partition(":")

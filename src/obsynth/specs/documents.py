@@ -203,7 +203,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
         close = suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         install = f" If it is that of a plug-in, install the package that provides {identifier}."
-        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close or install}")
+        problems.add("method.id", f"unknown method {identifier!r}.{close or install} There are: {known}.")
     elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
         options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
     problems.raise_if_any()

@@ -22,8 +22,13 @@ from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.region_bounds import region_bound
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of, require_no_region
+from obsynth.monitoring.thresholds.residual_norm_bounds import (
+    samples_of,
+    scaled_inputs,
+    unlimited_bound,
+    unlimited_paper,
+)
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
-from obsynth.monitoring.thresholds.stated_noise import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number
 from obsynth.numerics.arrays import FloatArray

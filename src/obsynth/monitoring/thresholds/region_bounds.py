@@ -21,7 +21,11 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model
 from obsynth.monitoring.thresholds.residual_monitor import bounds_of
-from obsynth.monitoring.thresholds.stated_noise import REMAINDER_AFTER_TABLE, UnlimitedHorizonBound, scaled_inputs
+from obsynth.monitoring.thresholds.residual_norm_bounds import (
+    REMAINDER_AFTER_TABLE,
+    UnlimitedHorizonBound,
+    scaled_inputs,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.proofs.vertex_inequalities import pairs_of, prove_decay

@@ -16,14 +16,14 @@ from obsynth.monitoring.thresholds.guaranteed import record_monitor
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
-from obsynth.monitoring.thresholds.rules import NormRule, WhitenedRule
-from obsynth.monitoring.thresholds.stated_noise import (
+from obsynth.monitoring.thresholds.residual_norm_bounds import (
     norms_of_windows,
     paper_threshold,
     pointwise_threshold,
     scaled_inputs,
     window_threshold,
 )
+from obsynth.monitoring.thresholds.rules import NormRule, WhitenedRule
 from obsynth.monitoring.thresholds.whitening import settled, steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.numerics.arrays import FloatArray

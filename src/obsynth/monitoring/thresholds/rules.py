@@ -12,7 +12,7 @@ from obsynth.monitoring.thresholds.between_samples import InputResponse
 from obsynth.monitoring.thresholds.change_statistics import two_sided_sums
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, GapState
 from obsynth.monitoring.thresholds.monitor import Rule, RuleOutput, Sample
-from obsynth.monitoring.thresholds.stated_noise import UnlimitedHorizonBound
+from obsynth.monitoring.thresholds.residual_norm_bounds import UnlimitedHorizonBound
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.outliers import chi_square_limit
 

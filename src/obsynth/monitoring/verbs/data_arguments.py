@@ -1,37 +1,28 @@
-"""A run on data from the command line: its arguments, its progress, its summary, and the proof of its alarm."""
+"""Runs on data from the command line: the run and its monitor from the arguments, and its summary."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.tables import text_table
-from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW, refuse_idle
+from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, refuse_idle
 from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
+from obsynth.monitoring.verbs.run_progress import health, rows_done
 from obsynth.plants.signal_names import listed
-from obsynth.report.terminal.arguments import STREAM, columns_of, flag_of, numbers_of, ranges_of, refuse_given
-from obsynth.report.terminal.output import output_file
+from obsynth.report.terminal.arguments import STREAM, columns_of, flag_of, numbers_of, refuse_given
 from obsynth.report.terminal.specs import require_same_signals, required_scenario
 
 if TYPE_CHECKING:
-    from obsynth.monitoring.alarms.proof_file import AlarmProof
     from obsynth.monitoring.logs.run import DataRun
     from obsynth.monitoring.thresholds.monitor import Monitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
-
-#: Seconds between the lines in which a run on a log that grows says that it is alive.
-HEALTH_SECONDS = 60.0
-
-#: Rows from the alarm on at whose windows a proof is tried, in windows.
-_LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
 
 
 def protect_inputs(options: argparse.Namespace) -> None:
@@ -85,20 +76,6 @@ def run_of(
     for text in run.warnings:
         print(f"Warning: {text}", file=sys.stderr)
     return run
-
-
-def health() -> Callable[[int], None]:
-    """Return what says on stderr every `HEALTH_SECONDS` how many rows are done, as long as rows come."""
-    begun = monotonic()
-    next_time = begun
-
-    def report_rows(rows: int) -> None:
-        nonlocal next_time
-        if monotonic() >= next_time:
-            next_time = monotonic() + HEALTH_SECONDS
-            print(f"{rows} rows in {monotonic() - begun:.0f} s.", file=sys.stderr, flush=True)
-
-    return report_rows
 
 
 def stated_delay(options: argparse.Namespace) -> int | None:
@@ -204,96 +181,3 @@ def summary_of_run(run: DataRun, watched: Monitor | None) -> str:
     if watched is not None:
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
-
-
-@contextmanager
-def rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | None]:
-    """Show a bar on a terminal: how many rows are done, of how many where that can be known."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("rows"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("rows", total=None if data == STREAM else _rows_in(Path(data)))
-        yield lambda rows: bar.update(task, completed=rows)
-
-
-def _rows_in(path: Path) -> int | None:
-    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole."""
-    from obsynth.monitoring.logs.sources import TEXT_SUFFIXES
-    from obsynth.monitoring.logs.unpacked_logs import log_suffix
-
-    try:
-        if path.suffix.lower() == ".parquet":
-            import pyarrow.parquet
-
-            return int(pyarrow.parquet.ParquetFile(path).metadata.num_rows)
-        if log_suffix(path) not in TEXT_SUFFIXES:
-            return None
-        with path.open("rb") as stream:
-            sample = stream.read(1 << 20)
-        # The rows of the beginning stand for all.
-        lines = sample.count(b"\n")
-        return round(path.stat().st_size / len(sample) * lines) - 1 if lines > 1 else None
-    except (OSError, ImportError, ValueError):
-        return None
-
-
-def certificate_target(options: argparse.Namespace) -> Path | None:
-    """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
-    if options.prove is None:
-        return None
-    from obsynth.monitoring.alarms.proof_file import CERTIFICATE
-
-    if options.monitor != "pointwise":
-        raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
-    if options.time_zone is not None:
-        raise SpecError("--prove counts rows by stamps with a zone, or in UTC: leave --time-zone out.", path="--prove")
-    if options.time_unit is not None:
-        raise SpecError(
-            "--prove reads the unit of the time in the log alone: call the column 'time [d]', and leave --time-unit "
-            "out.",
-            path="--prove",
-        )
-    if options.data == STREAM or options.state is not None:
-        raise SpecError(
-            "--prove reads the data again from their first row on: give --data a file, and no --state.", path="--prove"
-        )
-    return output_file(options.prove, CERTIFICATE, options, option="--prove")
-
-
-def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, run: DataRun, target: Path) -> dict[str, Any]:
-    """Return whether the first alarm of a run is proved, in words, and the certificate's file."""
-    row = run.alarm_rows.get("pointwise")
-    if row is None:
-        return {"proved": False, "row": None, "statement": "No alarm: there is nothing to prove.", "file": None}
-    window = options.window or WINDOW
-    tried = [min(row + int(share * window), run.rows) for share in _LATER]
-    for last in dict.fromkeys(max(number, 2) for number in tried):
-        proof = proof_of(design, options, last)
-        if proof.proved:
-            return {"proved": True, "row": last, "statement": proof.statement, "file": str(proof.save(target))}
-    return {"proved": False, "row": row, "statement": proof.statement, "file": None}
-
-
-def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **more: Any) -> AlarmProof:
-    """Return the proof, or why there is none, that the window up to a row of the data is not free of faults."""
-    from obsynth.monitoring.alarms.proving import prove_alarm
-
-    return prove_alarm(
-        with_input_delay(design, options),
-        Path(options.data),
-        row,
-        window=options.window or WINDOW,
-        columns=columns_of(options),
-        scales=numbers_of(options.scale),
-        disturbance_bounds=numbers_of(options.disturbance),
-        noise_bound=options.noise_bound,
-        disturbance=options.disturbance_course or "any",
-        initial_set=ranges_of(options.initial) or None,
-        unverified=options.unverified,
-        **more,
-    )

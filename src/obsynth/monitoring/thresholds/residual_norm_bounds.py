@@ -1,6 +1,6 @@
-"""Thresholds of the norm of a residual, or of a window of it: the paper's (66), and guaranteed bounds.
+"""Guaranteed bounds on the norm of a residual, or of a window of it, beside (66) of Wang et al. 2015.
 
-For records of known length, and of any length: a table for the start, and one number for ever after.
+For records of known length, and of any length: a table for the start, and one limit for all later samples.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, state_units
 from obsynth.verification.over_tolerances.responses import OUTWARD
 
-#: What is left of an error after the table.
+#: Share of an initial error that remains after the table: it then decides nothing, and the table stays short.
 REMAINDER_AFTER_TABLE = 1e-3
 
 #: Longest table, and most numbers in its powers.
