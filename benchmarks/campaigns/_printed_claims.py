@@ -158,7 +158,8 @@ def detectable(plant: WrittenPlant) -> tuple[bool, bool]:
 
     def more(z: complex) -> bool:
         seen = plant.C @ np.linalg.solve(z * np.eye(len(step)) - step, push.astype(complex)) + direct
-        seen = seen / np.linalg.norm(seen, axis=0)
+        sizes = np.linalg.norm(seen, axis=0)
+        seen = seen / np.where(sizes > 0.0, sizes, 1.0)
         ranks = [int(np.sum(np.linalg.svd(part, compute_uv=False) > RANK)) for part in (seen, seen[:, 1:])]
         return ranks[0] > ranks[1]
 

@@ -26,6 +26,18 @@ TANK = ob.DAEModel(
     inputs={"inflow": 0.5},
     parameters={"c": 0.5},
 )
+#: The second output is twice an algebraic state that is known without noise, but for the parameters.
+FIXED = ob.DescriptorSystem(
+    np.diag([1.0, 0.0]),
+    [[-0.5, 0.0], [1.0, 0.0]],
+    C=[[0.0, 0.0], [0.0, 2.0]],
+    Bf=[[2.0, 0.0], [0.0, 0.0]],
+    Df=[[0.0, -2.0], [-1.0, 2.0]],
+    Bw=np.zeros((2, 2)),
+    Dw=0.1 * np.eye(2),
+    dt=1.0,
+)
+GROWING = LINEAR.replace(A=[[2.0, 0.1, 0.0], [-0.2, 1.5, 0.1], [1.0, 0.5, -1.0]])
 BIASED = ob.DAEModel(
     {"balance": "der(level) = -level"}, {"y": "level + bias"}, states={"level": 1.0}, parameters={"bias": 0.0}
 )
@@ -41,6 +53,9 @@ NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {"Q": np.eye(3)}, "Bw Dw' is not zero"),
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "adaptive-observer", {"R": np.eye(2)}, "Bw Dw' is not zero"),
         (LINEAR.replace(Bd=np.eye(3), Dd=np.zeros((2, 3))), "descriptor-kalman", {}, "outputs do not determine"),
+        (FIXED, "adaptive-observer", {}, "determine the parameters exactly"),
+        (FIXED, "adaptive-observer", {"Q": 0.1, "R": 0.0}, "determine the parameters exactly"),
+        (GROWING, "descriptor-kalman", {"Q": 0.0, "R": 0.1, "initial_covariance": 0.0}, "Errors do not decay"),
         (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {}, "free of noise"),
         (LINEAR.replace(dt=0.0, A=-LINEAR.A), "functional-filter", {"delay": 2}, "count samples"),
         (LINEAR.replace(dt=0.0, A=-LINEAR.A), "optimal-filter", {"delay": 2}, "discrete time"),
@@ -59,6 +74,9 @@ def test_check_tells_what_is_not_stated(plant: Any, method: str, options: dict[s
         (TANK, "dae-adaptive-observer", NOISE),
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {}),
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {"Q": np.eye(3), "R": np.eye(2)}),
+        (FIXED, "adaptive-observer", {"Q": 0.1, "R": 0.1}),
+        (GROWING, "descriptor-kalman", {"Q": 0.0, "R": 0.1}),
+        (LINEAR, "descriptor-kalman", {"Q": np.diag([0.1, 0.0, 0.0]), "R": 0.1}),
         (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {"noise": {"y1": 0.1, "y2": 0.1}}),
     ],
 )

@@ -340,9 +340,9 @@ def _over_region(plant: Plant, method: Method, conditions: Sequence[Condition]) 
 
 def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:
     """Return the condition that fails where a design needs what neither the plant nor the options state."""
-    signals = error.signals if isinstance(error, PreconditionError) else ()
-    claim = "what a design needs is stated"
-    return Condition("stated", claim, False, np.nan, np.nan, method, str(error), signals=signals)
+    signals, unclear = (error.signals, error.unclear) if isinstance(error, PreconditionError) else ((), False)
+    claim, detail = "what a design needs is stated", str(error).removeprefix("Unclear: ")
+    return Condition("stated", claim, False, np.nan, np.nan, method, detail, signals=signals, unclear=unclear or None)
 
 
 def _existence(plant: Plant, method: Method) -> Sequence[Condition]:

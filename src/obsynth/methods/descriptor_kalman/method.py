@@ -157,17 +157,16 @@ class DescriptorKalman(Method):
         return kalman_conditions(plant, early=self.early_constraints)
 
     def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem) -> None:
-        """Raise `SpecError` where noise of the plant is none that the method covers."""
+        """Raise `SpecError` where noise of the plant is none that the method covers, `PreconditionError` where what
+        has no noise allows no gains."""
         if isinstance(plant, PolytopicSystem):
             from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
 
             NoiseOverRegion.of(plant, self.Q, self.R)
             return
-        from obsynth.analysis.existence.kalman import with_stated_noise
-        from obsynth.analysis.existence.shared_noise import shared_noise
+        from obsynth.methods.engines.recursive.synthesis import require_gains
 
-        if shared_noise(plant, Q=self.Q, R=self.R) is None:
-            with_stated_noise(plant, self.as_given())
+        require_gains(plant, self)
 
     def synthesise(
         self,

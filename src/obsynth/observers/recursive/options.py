@@ -56,17 +56,16 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
         value = stated.item() if isinstance(stated, np.generic) else stated
         if isinstance(value, MatrixSequence):
             plain[name] = value.as_data() if value.is_data else value.function
-        elif (
-            value is None or callable(value) or isinstance(value, (bool, int, float, str, Mapping)) or _has_text(value)
-        ):
+        elif value is None or callable(value) or isinstance(value, (bool, int, float, str, Mapping)) or has_text(value):
             plain[name] = value
         else:
             plain[name] = np.array(value, dtype=np.float64)
     return plain
 
 
-def _has_text(value: Any) -> bool:
-    return isinstance(value, (list, tuple)) and any(isinstance(item, str) or _has_text(item) for item in value)
+def has_text(value: Any) -> bool:
+    """Whether an option is written with texts, which may depend on k."""
+    return isinstance(value, (list, tuple)) and any(isinstance(item, str) or has_text(item) for item in value)
 
 
 def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSystem) -> MatrixSequence:

@@ -168,11 +168,9 @@ def settled_contraction(observer: RecursiveObserver) -> float | None:
     alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
     if not alike or plant.horizon or observer.early_constraints:
         return None
-    q, r, start = observer.Q.at(0), observer.R.at(0), np.asarray(observer.initial_covariance)
-    deviations = np.sqrt(np.maximum(np.diag(start), np.finfo(np.float64).tiny))
-    known_exactly = not decide_rank(start / np.outer(deviations, deviations)).full
-    if known_exactly and _unreached(plant, covariance_factor(q, "Q"), covariance_factor(r, "R")):
+    if not forgets_its_start(observer):
         return None
+    q, r = observer.Q.at(0), observer.R.at(0)
     try:
         # The solution is judged by its own residual, whatever LAPACK thinks of the digits on the way.
         with warnings.catch_warnings(action="ignore"):
@@ -180,6 +178,17 @@ def settled_contraction(observer: RecursiveObserver) -> float | None:
     except (PreconditionError, SolverError, SpecError):
         return None
     return float(np.sqrt(steady.rate))
+
+
+def forgets_its_start(observer: RecursiveObserver) -> bool:
+    """Whether gains tend to those of the steady state from the stated covariance of the first state: it is uncertain in
+    all states, or noise, which is constant, reaches every mode that does not decay."""
+    start = np.asarray(observer.initial_covariance)
+    deviations = np.sqrt(np.maximum(np.diag(start), np.finfo(np.float64).tiny))
+    if decide_rank(start / np.outer(deviations, deviations)).full:
+        return True
+    q, r = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+    return not _unreached(observer.plant, q, r)
 
 
 def _unreached(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> list[complex]:

@@ -16,7 +16,7 @@ from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, a
 from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.ranks import covariance_factor, decide_rank
 from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
@@ -24,8 +24,8 @@ from obsynth.observers.recursive.gain_schedule_summary import (
     gain_schedule_summary,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.options import observer_from_options, plain_options
-from obsynth.observers.recursive.steady_filter import reached_condition
+from obsynth.observers.recursive.options import has_text, observer_from_options, plain_options
+from obsynth.observers.recursive.steady_filter import forgets_its_start, reached_condition
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import FAR_UNITS, PlantUnits
 from obsynth.plants.signal_names import leading_names
@@ -52,6 +52,28 @@ def synthesise(
     options |= _of_first_state(shared, options)
     synthesis = _with_independent_noises(shared.plant, options, progress=progress)
     return replace(synthesis, notes=(shared.note, *synthesis.notes))
+
+
+def require_gains(plant: DescriptorSystem | TimeVaryingDescriptorSystem, method: Method) -> None:
+    """Raise `PreconditionError` where the noise as stated allows no gains, or none with which errors decay.
+
+    Asked where some equation or output has no noise; where all have, the conditions of existence decide."""
+    options = method.as_given()
+    if shared_noise(plant, Q=options["Q"], R=options["R"]) is None:
+        options = with_stated_noise(plant, options)
+        if all(options[name] is None or _is_definite(options[name]) for name in ("Q", "R")):
+            return
+    synthesise(plant, method, progress=lambda _: None)
+
+
+def _is_definite(covariance: Any) -> bool:
+    """Whether a stated covariance is constant and nonsingular."""
+    if callable(covariance) or isinstance(covariance, Mapping) or has_text(covariance):
+        return False
+    matrix = np.asarray(covariance)
+    if matrix.dtype.kind not in "if" or matrix.ndim not in (0, 2):
+        return False
+    return decide_rank(np.atleast_2d(matrix.astype(np.float64))).full
 
 
 def _with_independent_noises(
@@ -145,12 +167,14 @@ def _identities(units: PlantUnits, options: Mapping[str, Any]) -> dict[str, Floa
 
 
 def _has_steady_state(observer: RecursiveObserver) -> bool:
-    """Whether a time-invariant plant is detectable, and Q reaches its modes: then its initial-condition response
-    decays."""
+    """Whether a time-invariant plant is detectable, and Q or the first covariance reaches its modes: then its
+    initial-condition response decays."""
     if not (observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant):
         return False
     roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
-    return detectability_condition(observer.plant).holds and reached_condition(observer.plant, *roots).holds
+    if not (detectability_condition(observer.plant).holds and reached_condition(observer.plant, *roots).holds):
+        return False
+    return forgets_its_start(observer)
 
 
 def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, identity: Sequence[str]) -> None:
