@@ -322,3 +322,23 @@ def test_an_option_that_no_method_has_is_named() -> None:
     plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
     with pytest.raises(obsynth.SpecError, match=r"No method has the option 'gama'\. Did you mean 'gamma'"):
         obsynth.design(plant, gama=2.0)
+
+
+def test_a_scenario_names_its_argument_by_what_others_call_it() -> None:
+    with pytest.raises(TypeError, match=r"no argument 'duration'\. Did you mean 'horizon'\?"):
+        obsynth.Scenario(duration=30.0)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"no argument 'x0'\. Did you mean 'initial_state'\?"):
+        obsynth.Scenario(horizon=30.0, x0={})  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("value", ["many", "2.5"])
+def test_a_word_in_place_of_a_number_is_refused_in_words(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["evaluate", "gains.json", "--runs", value])
+    assert f"argument --runs: '{value}' is no whole number." in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_gain_set_says_how_one_is_written(tmp_path: Path) -> None:
+    (tmp_path / "gains.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(obsynth.SpecError, match=r"is no gain set.*obsynth design --system SPEC --output FILE"):
+        obsynth.load(tmp_path / "gains.json")

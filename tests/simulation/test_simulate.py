@@ -391,3 +391,13 @@ def test_estimates_without_deviations_have_none() -> None:
     assert np.isnan(found.state_deviations).all()
     assert found.fault_deviations.shape == found.parameters.shape == (3, 1)
     assert found.nis.size == 0
+
+
+def test_what_begins_after_the_end_of_a_scenario_is_refused_by_name_or_left_out_where_it_is_shortened() -> None:
+    late = obsynth.Step(size=1.0, start=20.0)
+    with pytest.raises(obsynth.SpecError, match=r"'pump' among the faults begins at 20 s.*ends at 10 s") as refused:
+        obsynth.Scenario(horizon=10.0, faults={"pump": late})
+    assert refused.value.path == "faults.pump"
+    scenario = obsynth.Scenario(horizon=20.0, faults={"pump": late}, inputs={"u": [late, obsynth.Step(size=2.0)]})
+    ended = scenario.replace(horizon=15.0)
+    assert (ended.horizon, ended.faults, ended.inputs) == (15.0, {}, {"u": (obsynth.Step(size=2.0),)})

@@ -41,6 +41,9 @@ class Parser(argparse.ArgumentParser):
             commands = next(item.choices for item in self._actions if isinstance(item, argparse._SubParsersAction))
             word = choice.group(2)
             message = f"there is no command {word!r}.{meant(word, list(commands))} {self.prog} --help lists them all."
+        elif (number := re.match(r"argument (\S+): invalid (int|float) value: ('.*')", message)) is not None:
+            wanted = "whole number" if number.group(2) == "int" else "number"
+            message = f"argument {number.group(1)}: {number.group(3)} is no {wanted}."
         elif message.startswith("the following arguments are required"):
             known = list(self._option_string_actions)
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]

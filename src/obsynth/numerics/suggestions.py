@@ -78,7 +78,7 @@ def keywords_suggested(function: Callable[Given, Returned], meant: Meant | None 
     return called
 
 
-def fields_suggested(cls: Class) -> Class:
+def fields_suggested(cls: Class, meant: Meant | None = None) -> Class:
     """Return a class whose constructor suggests names for keyword arguments which it does not have."""
-    cls.__init__ = keywords_suggested(cls.__init__)  # type: ignore[misc]
+    cls.__init__ = keywords_suggested(cls.__init__, meant)  # type: ignore[misc]
     return cls

@@ -44,6 +44,9 @@ _HEAD_BYTES = 256
 
 _Made = TypeVar("_Made")
 
+#: How a gain set comes to be: what to do about a file that is none.
+HOW_WRITTEN = "Write one with obsynth design --system SPEC --output FILE, or ObserverDesign.save."
+
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
 
@@ -125,7 +128,7 @@ def loaded(content: bytes, name: str = "the gain set") -> ObserverDesign:
         text, arrays = unpacked(content) if is_packed(content) else (content.decode("utf-8"), None)
         document = json_data(text)
     except ValueError as error:
-        raise SpecError(f"{name} is no gain set of obsynth ({error}).", path=name) from error
+        raise SpecError(f"{name} is no gain set of obsynth ({error}). {HOW_WRITTEN}", path=name) from error
     return _design_of(document, arrays, name)
 
 
@@ -142,13 +145,13 @@ def _read_members(source: Path) -> tuple[Any, bytes | None]:
         text, arrays = unpacked(file.read_bytes())
         return json_data(text), arrays
     except (ValueError, RecursionError) as error:
-        raise SpecError(f"{source} is no gain set of obsynth: {error}.", path=str(source)) from error
+        raise SpecError(f"{source} is no gain set of obsynth: {error}. {HOW_WRITTEN}", path=str(source)) from error
 
 
 def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesign:
     """Return the design in a document whose digest is right."""
     if not isinstance(document, dict) or document.get("kind") != GAIN_SET_KIND:
-        raise SpecError(f"{source} is no gain set of obsynth.", path=source)
+        raise SpecError(f"{source} is no gain set of obsynth. {HOW_WRITTEN}", path=source)
     if document.get("schema_version") != GAIN_SET_VERSION:
         version = document.get("schema_version")
         raise SpecError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
@@ -61,6 +61,14 @@ _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
     "scheduling": _ADDITIVE,
 }
 
+#: Arguments of a scenario by what they are called elsewhere.
+OTHER_NAMES = {
+    **dict.fromkeys(("duration", "length", "end", "t_end", "tf", "stop_time", "until", "time"), "horizon"),
+    **dict.fromkeys(("dt", "ts", "h", "step", "step_size"), "sample_time"),
+    **dict.fromkeys(("x0", "initial", "start"), "initial_state"),
+    **dict.fromkeys(("z0", "initial_observer_state"), "observer_state"),
+}
+
 #: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
 _GROUP_NAMES = {
     "inputs": "input_names",
@@ -74,7 +82,13 @@ _GROUP_NAMES = {
 Profiles = Mapping[str, Profile | Sequence[Profile]]
 
 
-@fields_suggested
+def _name_meant(name: str, known: Iterable[str], given: Iterable[str]) -> str:
+    """Return a question with the argument of a scenario that a wrong name means, or nothing."""
+    meant = OTHER_NAMES.get(name.casefold(), "")
+    return f" Did you mean {meant!r}?" if meant in known and meant not in given else suggestion(name, known)
+
+
+@partial(fields_suggested, meant=_name_meant)
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
     """The inputs, faults, disturbances and noise of a simulation, by signal; several profiles of one signal add up.
@@ -110,7 +124,7 @@ class Scenario:
     Raises
     ------
     SpecError
-        A number is out of range, or a profile is of a kind that its signal cannot have.
+        A number is out of range, a profile is of a kind that its signal cannot have, or it begins after the horizon.
 
     Examples
     --------
@@ -147,6 +161,7 @@ class Scenario:
         whole_number(self.seed, "seed", least=0)
         for group, kinds in _ALLOWED.items():
             object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
+        _require_begun(self)
         for name in ("sensor_noise", "initial_state"):
             object.__setattr__(self, name, MappingProxyType(_checked_numbers(getattr(self, name), name)))
         if any(value < 0.0 for value in self.sensor_noise.values()):
@@ -166,14 +181,19 @@ class Scenario:
         return partial(Scenario, **arguments), ()
 
     def replace(self, **changes: Any) -> Scenario:
-        """Return the scenario with some fields changed, such as its seed.
+        """Return the scenario with some fields changed, such as its seed; one that ends earlier is without what would
+        begin after that.
 
         Parameters
         ----------
         **changes
             Any argument of the constructor.
         """
-        return replace(self, **changes)
+        horizon = changes.get("horizon", self.horizon)
+        if not (is_number(horizon) and horizon < self.horizon):
+            return replace(self, **changes)
+        begun: dict[str, Any] = {group: _begun(getattr(self, group), horizon) for group in _ALLOWED}
+        return replace(self, **{**begun, **changes})
 
     def as_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data, as `scenario_from` reads it."""
@@ -273,13 +293,18 @@ def observer_start(scenario: Scenario, order: int) -> FloatArray:
     return np.zeros(order) if state is None else np.array(state)
 
 
+def _as_tuple(value: Any) -> tuple[Any, ...]:
+    """Return one profile, or some, as a tuple; an empty one for anything else."""
+    return (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
+
+
 def _checked_profiles(
     profiles_by_signal: Any, group: str, kinds: tuple[type[Profile], ...]
 ) -> dict[str, tuple[Profile, ...]]:
     require_kind(profiles_by_signal, Mapping, group, "profiles by the names of signals")
     checked = {}
     for name, value in profiles_by_signal.items():
-        profiles = (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
+        profiles = _as_tuple(value)
         where = f"{group}.{name}"
         if not profiles or not all(isinstance(profile, Profile) for profile in profiles):
             size = float(value) if is_number(value) else 1.0
@@ -297,6 +322,27 @@ def _checked_profiles(
             raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
         checked[str(name)] = profiles
     return checked
+
+
+def _begun(profiles_by_signal: Profiles, horizon: float) -> dict[str, list[Profile]]:
+    """Return the profiles that begin by some time, seconds, without signals that have none of these."""
+    begun = {
+        name: [profile for profile in _as_tuple(value) if profile.start <= horizon]
+        for name, value in profiles_by_signal.items()
+    }
+    return {name: profiles for name, profiles in begun.items() if profiles}
+
+
+def _require_begun(scenario: Scenario) -> None:
+    """Raise `SpecError` for a profile that begins after the horizon: it would be absent without a word."""
+    for group in _ALLOWED:
+        for name, profile in profiles_of(scenario, group):
+            if profile.start > scenario.horizon:
+                raise SpecError(
+                    f"{name!r} among the {group} begins at {profile.start:g} s, and the scenario ends at "
+                    f"{scenario.horizon:g} s: begin earlier, or give a longer horizon.",
+                    path=f"{group}.{name}",
+                )
 
 
 def _checked_numbers(numbers: Any, name: str) -> dict[str, float]:
