@@ -19,9 +19,9 @@ from obsynth.methods.installed import REGISTRY
 from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import WrittenAs, field_types
 from obsynth.report.terminal.arguments import settings_of
-from obsynth.specs import schema, schema_plants, schema_sections, schema_values
+from obsynth.specs import schema, schema_options, schema_plants, schema_sections, schema_values
 
-_SCHEMA = (schema_values, schema_plants, schema_sections, schema)
+_SCHEMA = (schema_values, schema_options, schema_plants, schema_sections, schema)
 
 
 def _of(name: str) -> Any:

@@ -27,8 +27,8 @@ from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.results.checks import Check as Check
-from obsynth.simulation.signals import Trajectory as Trajectory
 from obsynth.simulation.simulate import Simulation as Simulation
+from obsynth.simulation.trajectory import Trajectory as Trajectory
 from obsynth.studies.comparison import ComparedMethod as ComparedMethod
 from obsynth.studies.comparison import FaultComparison as FaultComparison
 from obsynth.studies.evaluate import Evaluation as Evaluation

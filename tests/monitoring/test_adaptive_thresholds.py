@@ -16,7 +16,7 @@ from uncertain_plants import DRIVE, drive, wang
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.monitoring.thresholds.adaptive_monitor import adaptive_plan
-from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.observers.saved_states import state_as_data, state_from_data
 from obsynth.simulation.benches import make_bench
 from obsynth.verification.over_tolerances.adaptive_recursion import AdaptiveState, adaptive_step, thresholds_of_records
 from obsynth.verification.over_tolerances.plants_of_the_box import drawn_points, plant_at

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from obsynth.numerics.doubling import compared_gain
+from obsynth.numerics.gain_levels import compared_gain
 from obsynth.numerics.norms import balanced_realisation, hinf_norm
 
 

@@ -10,16 +10,12 @@ from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 from obsynth.numerics.central_equation import CentralEquation, Whitened, central_injection
 from obsynth.numerics.central_filter import central_filter_at, search_central_filter
-from obsynth.numerics.doubling import (
-    FIRST_POWER,
-    RankWatch,
-    compared_gain,
-    continuous_riccati_solution,
-    doubled_riccati_solution,
-)
+from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
+from obsynth.numerics.gain_levels import compared_gain
 from obsynth.numerics.injection_problem import GainProblem, Injection
 from obsynth.numerics.matrix_equations import bounded_real_matrix
 from obsynth.numerics.norms import hinf_norm, largest_peak, spectral_radius
+from obsynth.numerics.thin_doubling import FIRST_POWER, RankWatch
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):

@@ -13,7 +13,7 @@ from test_validate import designed
 import obsynth
 from obsynth import SolverError, SpecError, run_on_data, simulate_dae
 from obsynth.observers.outliers import beside_others
-from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.observers.saved_states import state_as_data, state_from_data
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 

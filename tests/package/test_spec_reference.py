@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from obsynth.specs import schema, schema_plants, schema_sections, schema_values
+from obsynth.specs import schema, schema_options, schema_plants, schema_sections, schema_values
 
 DOCS = Path(__file__).parents[2] / "docs"
-PARTS = (schema_values, schema_plants, schema_sections, schema)
+PARTS = (schema_values, schema_options, schema_plants, schema_sections, schema)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.simulation.linear import simulate_plant, simulate_time_varying
-from obsynth.simulation.signals import Trajectory
+from obsynth.simulation.trajectory import Trajectory
 from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

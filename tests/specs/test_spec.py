@@ -17,7 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY
 from obsynth.specs.loader import load_spec
 from obsynth.specs.matrix_files import read_matrix
-from obsynth.specs.schema_values import options_schema
+from obsynth.specs.schema_options import options_schema
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 

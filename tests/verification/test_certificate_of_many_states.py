@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from obsynth.methods.fault_estimation_filter.certificate import ROOMS, _with_room
-from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.injection_problem import _natural_states
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.thin_doubling import FEWEST_STATES
 
 
 def system(seed, n=40, inputs=7):

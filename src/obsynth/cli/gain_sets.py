@@ -1,4 +1,4 @@
-"""The verbs that take a gain set further: exports and pages."""
+"""The verbs ``export`` and ``report``: files for other programs, and pages, from a gain set."""
 
 from __future__ import annotations
 

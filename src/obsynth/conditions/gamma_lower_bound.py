@@ -1,8 +1,6 @@
-"""What no filter can reach: a lower bound on the gain from a dual point that passes our own check.
+"""Lower bounds on the gain of every filter, from dual points of the inequalities that pass our own check.
 
-What no measurement sees: output-nulling pairs (x, d), ``C x + D d = 0``, lead to ``A x + B d`` whatever the gains.
-
-States reached from rest by them matter, and those that grow unseen (zeros from d outside the unit circle).
+No gain has an effect on the output-nulling pairs (`obsynth.numerics.output_nulling`): the dual variables weight them.
 """
 
 from __future__ import annotations
@@ -18,8 +16,14 @@ from obsynth.conditions import lmi
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.injection_problem import GainProblem, Injection, NormalisedProblem, normalise
-from obsynth.numerics.matrix_equations import lyapunov_solution
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.output_nulling import (
+    growing_states,
+    invisible_pairs,
+    null_space,
+    range_space,
+    reached_from_rest,
+    strict_point,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import nearest_doubles
 from obsynth.verification.least_gain_proof import (
@@ -30,9 +34,6 @@ from obsynth.verification.least_gain_proof import (
     PROVED_SHARE,
     InvisiblePairs,
 )
-
-#: An invariant zero must have a modulus above one by this much to count as growing.
-GROWTH_MARGIN = 1e-6
 
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.
@@ -58,93 +59,6 @@ MOST_RUN_UNKNOWNS = 96
 LONG_ENOUGH = 1e-5
 
 _BOUND_PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
-
-
-def _rank(values: FloatArray) -> int:
-    """Return how many singular values, largest first, count; data are normalised, so that one is a natural size."""
-    return int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-
-
-def null_space(matrix: FloatArray) -> FloatArray:
-    """Return an orthonormal null basis of a matrix of any rank."""
-    _, values, right = np.linalg.svd(matrix)
-    return np.asarray(right[_rank(values) :].T)
-
-
-def _range(matrix: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the range."""
-    left_vectors, values, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left_vectors[:, : _rank(values)])
-
-
-def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the states, the disturbances and the next states of a basis of the output-nulling pairs."""
-    basis = null_space(np.hstack([problem.C, problem.D]))
-    return basis[: problem.order], basis[problem.order :], np.hstack([problem.A, problem.B]) @ basis
-
-
-def reached_from_rest(top: FloatArray, image: FloatArray) -> FloatArray:
-    """Return a basis of the least subspace with the next state of each output-nulling pair whose state is in it."""
-    subspace = np.zeros((top.shape[0], 0))
-    while True:
-        pairs = null_space(np.hstack([top, -subspace]))[: top.shape[1]]
-        larger = _range(np.hstack([subspace, image @ pairs]))
-        if larger.shape[1] == subspace.shape[1]:
-            return subspace
-        subspace = larger
-
-
-def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatArray:
-    """Return the states, outside of those reached from rest, that grow invisibly."""
-    from scipy.linalg import schur
-
-    outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
-    pairs = _range((outside.T @ top).T)  # one pair for each state outside; the other pairs stay inside
-    while True:
-        states, following = outside.T @ top @ pairs, outside.T @ image @ pairs
-        inverse = np.linalg.pinv(states)
-        further = null_space(following - states @ inverse @ following)
-        if further.shape[1] == pairs.shape[1]:
-            break
-        pairs = pairs @ further
-    if pairs.shape[1] == 0:
-        return np.zeros((top.shape[0], 0))
-    _, vectors, count = schur(
-        inverse @ following, output="real", sort=lambda re, im: np.hypot(re, im) > 1.0 + GROWTH_MARGIN
-    )
-    return np.asarray(top @ pairs @ vectors[:, :count])
-
-
-def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
-    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``, from pairs of all kinds."""
-    n, size = top.shape
-    # Sequences from rest of every length, summed up: half of what is reached goes on unseen, the other half is slack.
-    point, reached = np.zeros((size, size)), np.zeros((n, 0))
-    for _ in range(n + 1):
-        unseen = null_space(np.hstack([top, -reached]))[:size]
-        point = point + 0.5 * unseen @ unseen.T
-        left_vectors, values, _ = np.linalg.svd(image @ unseen * np.sqrt(0.5), full_matrices=False)
-        rank = _rank(values)
-        reached = left_vectors[:, :rank] * values[:rank]
-    point, reached = 0.5 * (point + point.T), _range(reached)
-    outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
-    if outside.shape[1] == 0:
-        return point
-    # Pairs on the growing states, and as many from rest as make up for what those do to the reached states.
-    pairs = np.linalg.pinv(outside.T @ top)
-    back = np.linalg.inv(outside.T @ image @ pairs)
-    grown = lyapunov_solution(back.T, back @ back.T)
-    if grown is None or not np.all(np.isfinite(grown)):
-        raise np.linalg.LinAlgError("the growing states are too close to the boundary")
-    growing = pairs @ grown @ pairs.T
-    if reached.shape[1] == 0:
-        return np.asarray(growing)
-    slack = [image @ item @ image.T - top @ item @ top.T for item in (point, growing)]
-    inside = float(np.linalg.eigvalsh(reached.T @ slack[0] @ reached)[0])
-    # On the growing states the slack is the identity, so this Schur complement is all there is to fear.
-    spoilt = largest_singular_value(reached.T @ slack[1] @ reached)
-    spoilt += largest_singular_value(reached.T @ slack[1] @ outside) ** 2
-    return np.asarray((1.0 + spoilt / inside) * point + growing)
 
 
 def proved_lower_bound(
@@ -181,7 +95,7 @@ def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
     full = normalised.problem
     top, _, image = invisible_pairs(full)
     reached = reached_from_rest(top, image)
-    subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
+    subspace = range_space(np.hstack([reached, growing_states(top, image, reached)]))
     t = subspace.T
     work = replace(
         full,

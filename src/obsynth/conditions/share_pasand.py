@@ -42,8 +42,8 @@ from obsynth.conditions.share_pasand_over_region import share_pasand_over_region
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.doubling import is_positive
 from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.gain_levels import is_positive
 from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem

@@ -13,6 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import Alarms, ExportedMonitor
+from obsynth.exporting.c_precision import in_floats, in_precision
 from obsynth.exporting.c_source import (
     alarm_comments,
     c_identifier,
@@ -26,7 +27,7 @@ from obsynth.exporting.c_source import (
     table_lines,
     with_c_linkage,
 )
-from obsynth.exporting.dae_float import float_error, in_floats, in_precision
+from obsynth.exporting.dae_float import float_error
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
 from obsynth.numerics.arrays import FloatArray

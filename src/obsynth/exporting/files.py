@@ -12,11 +12,11 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import Alarms, ExportedMonitor, Monitor, linear_alarms, scheduled_alarms
+from obsynth.exporting.c_precision import in_precision
 from obsynth.exporting.c_scheduled import scheduled_c_texts
 from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
 from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
 from obsynth.exporting.dae_c_source import dae_alarms, threshold_header, threshold_source, write_dae_c
-from obsynth.exporting.dae_float import in_precision
 from obsynth.exporting.float_error import float_error
 from obsynth.exporting.independent import copy_checker
 from obsynth.exporting.proof_file import write_proof

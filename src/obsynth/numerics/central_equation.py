@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
+from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution
+from obsynth.numerics.gain_levels import is_positive
 from obsynth.numerics.injection_problem import GainProblem, Injection
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from obsynth.errors import SolverError, counted
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import (
@@ -25,6 +24,7 @@ from obsynth.numerics.norms import (
     state_units,
 )
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.thin_doubling import FEWEST_STATES
 
 #: Slack of the bounded real matrix that normalises, relative to the squared norm of what is shown.
 NORMALISING_SLACK = 1e-6

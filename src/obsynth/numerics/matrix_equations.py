@@ -15,7 +15,8 @@ import numpy as np
 import scipy
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
-from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
+from obsynth.numerics.doubling import doubled_riccati_solution
+from obsynth.numerics.gain_levels import REFUTED, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.scaling import power_of_two_below
 

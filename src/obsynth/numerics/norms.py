@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.doubling import compared_gain
+from obsynth.numerics.gain_levels import compared_gain
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings, resolved
 from obsynth.numerics.scaling import balancing_factors
 

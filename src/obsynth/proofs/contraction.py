@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
-from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
+from obsynth.numerics.thin_doubling import symmetric_product
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite

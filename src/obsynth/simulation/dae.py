@@ -17,7 +17,7 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae_signals import checked_inputs, finite_vector, step_length
 from obsynth.plants.implicit_step import ImplicitStep, onto_constraint
-from obsynth.simulation.signals import Trajectory
+from obsynth.simulation.trajectory import Trajectory
 
 
 @arguments_checked

@@ -28,7 +28,8 @@ from obsynth.plants.transformations.elimination import eliminate_algebraic_state
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.signals import ScenarioSignals, Trajectory, resolve, signal_of
+from obsynth.simulation.signals import ScenarioSignals, resolve, signal_of
+from obsynth.simulation.trajectory import Trajectory
 
 #: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
 PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]

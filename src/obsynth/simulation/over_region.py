@@ -22,7 +22,8 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.simulation.linear import PlantRuns
 from obsynth.simulation.profiles import Additive
 from obsynth.simulation.scenario import Scenario, profiles_of
-from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
+from obsynth.simulation.signals import ScenarioSignals, signal_of
+from obsynth.simulation.trajectory import Trajectory
 
 #: Parts of an interval in which parameters move: the error of each falls with the cube of its length.
 PARTS = 8

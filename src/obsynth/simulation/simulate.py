@@ -29,7 +29,7 @@ from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import simulate_plant, simulate_time_varying
 from obsynth.simulation.over_region import simulate_polytopic
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.signals import Trajectory
+from obsynth.simulation.trajectory import Trajectory
 
 #: An initial state that is off by less than this, relative to its size, is off by rounding only.
 CONSISTENCY_TOLERANCE = 1e-9

@@ -185,7 +185,7 @@ class DocumentProblems:
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
-    from obsynth.specs.schema_values import options_schema
+    from obsynth.specs.schema_options import options_schema
 
     problems = DocumentProblems(source, what="spec", document=document)
     _check_version(document, problems)
@@ -231,7 +231,7 @@ def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -
 
 def _options_of_any(raw_options: dict[str, Any], source: Path) -> dict[str, Any]:
     """Return options as the first method reads them that has them all; `auto` decides between those that do."""
-    from obsynth.specs.schema_values import options_schema
+    from obsynth.specs.schema_options import options_schema
 
     if not raw_options:
         return {}

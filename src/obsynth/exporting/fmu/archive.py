@@ -13,9 +13,9 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import ExportedMonitor, linear_alarms
+from obsynth.exporting.c_precision import in_precision
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts, require_no_sample_time
-from obsynth.exporting.dae_float import in_precision
 from obsynth.exporting.fmu.description import build_description, model_description
 from obsynth.exporting.fmu.layout import PREFIX, layout_header
 from obsynth.exporting.fmu.signals import FmuSignals, signals_of_dae, signals_of_linear

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import is_positive
+from obsynth.numerics.gain_levels import is_positive
 from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.verification.error_polytope import ErrorPolytope
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change
 from obsynth.numerics.norms import output_covariance, state_units
+from obsynth.numerics.thin_doubling import FEWEST_STATES
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel

@@ -15,7 +15,8 @@ from obsynth.conditions.pd_inequalities import PdSolution, PdTask
 from obsynth.errors import SolverError
 from obsynth.methods.pd_observer.certificate import coupled_certificate, symmetric_certificate
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
+from obsynth.numerics.doubling import continuous_riccati_solution, symmetric
+from obsynth.numerics.gain_levels import EQUATION_TOLERANCE
 from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.numerics.ranks import NEGLIGIBLE_SHARE
 from obsynth.numerics.spectra import abscissa

@@ -19,7 +19,7 @@ from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
 from obsynth.methods.region_observer.method import RegionObserverMethod
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.doubling import is_positive
+from obsynth.numerics.gain_levels import is_positive
 from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.records import named_vector

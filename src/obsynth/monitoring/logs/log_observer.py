@@ -13,7 +13,7 @@ from obsynth.monitoring.logs.clock import LONGEST_BRIDGE
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
-from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.observers.saved_states import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Statuses of a row of estimates.

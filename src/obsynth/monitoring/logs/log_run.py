@@ -34,7 +34,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.running import BY_COLUMNS
+from obsynth.observers.saved_states import BY_COLUMNS
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign

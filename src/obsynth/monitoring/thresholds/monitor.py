@@ -22,7 +22,7 @@ from obsynth.observers.detection import Detection
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.nonlinear.estimates import DAERow
 from obsynth.observers.recursive.sample import RawEstimate
-from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.observers.saved_states import state_as_data, state_from_data
 from obsynth.plants.constants import shown
 
 if TYPE_CHECKING:

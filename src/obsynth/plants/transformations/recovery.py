@@ -1,4 +1,4 @@
-"""What a transformation did, and the map back to the states of the plant it started from."""
+"""The result of a transformation: the new plant, and the map from its states back to those of its source."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class StateRecovery:
         return self.__dict__.get("operator")
 
     def flags(self) -> tuple[str, ...]:
-        """Return per source state what an estimate from state and input alone is; a bias wins."""
+        """Return per source state what an estimate from state and input alone is; where both hold, the bias."""
         return tuple(
             "biased by the disturbance" if biased.any() else "needs the fault estimate" if faulty.any() else "exact"
             for biased, faulty in zip(self.from_disturbance, self.from_fault, strict=True)
