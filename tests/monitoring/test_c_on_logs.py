@@ -102,7 +102,9 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     # Narrower than the logs, so that levels are raised in some of their rows.
     signals = (*design.plant.input_names, *design.plant.output_names)
     ends = np.full(len(signals), 0.7)
-    ranges = LearnedRanges(signals, len(design.plant.input_names), -ends, ends, np.zeros(len(signals)))
+    nu = len(design.plant.input_names)
+    rates = np.linspace(0.1, 1.0, nu * len(levels)).reshape(nu, len(levels))
+    ranges = LearnedRanges(signals, nu, -ends, ends, np.zeros(len(signals)), rates)
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
                              seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts,

@@ -26,16 +26,16 @@ def design() -> obsynth.ObserverDesign:
     return obsynth.fault_estimation_filter(plant)
 
 
-def log(seed: int, span: float, *, fault: float = 0.0) -> pd.DataFrame:
+def log(seed: int, span: float, *, fault: float = 0.0, mismatch: float = MISMATCH, rows: int = ROWS) -> pd.DataFrame:
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.uniform(-span, span, ROWS // 50), 50)
+    u = np.repeat(rng.uniform(-span, span, rows // 50), 50)
     u[:50], u[50:100] = span, -span
-    x, rows = np.zeros(2), []
+    x, table = np.zeros(2), []
     plant = design().plant
-    for k in range(ROWS):
-        rows.append([float(k), 5.0 + u[k], *(x + 0.1 * rng.standard_normal(2))])
-        x = plant.A @ x + (1.0 + MISMATCH) * plant.B @ u[k : k + 1] + plant.Bf @ [fault * (k >= FAULT_AT)]
-    return pd.DataFrame(rows, columns=["time", "u", "a", "b"])
+    for k in range(rows):
+        table.append([float(k), 5.0 + u[k], *(x + 0.1 * rng.standard_normal(2))])
+        x = plant.A @ x + (1.0 + mismatch) * plant.B @ u[k : k + 1] + plant.Bf @ [fault * (k >= FAULT_AT)]
+    return pd.DataFrame(table, columns=["time", "u", "a", "b"])
 
 
 @functools.cache
@@ -50,10 +50,33 @@ def test_set_points_beyond_those_of_the_normal_log_do_not_alarm_and_are_named() 
     (text,) = [text for text in run.warnings if text.startswith("u leaves the range")]
     assert "(4 to 6)" in text
     assert "reaches" in text
-    assert "levels are up to 25 times as high" in text
+    assert "levels are up to" in text
     # As thresholds were before ranges were among them.
     without = obsynth.online_monitor(design(), "learned", normal=replace(learned(), ranges=None))
     assert obsynth.run_on_data(design(), log(1, 5.0), monitor=without).events != ()
+
+
+def test_levels_rise_beyond_the_range_by_what_the_logs_say_of_the_model_alone() -> None:
+    """A model without an error that follows the input: rates are small, and a fault alarms beyond the range."""
+    exact = obsynth.learn_thresholds(design(), log(0, 1.0, mismatch=0.0, rows=2000), false_alarms="1 per 200 rows")
+    wrong = obsynth.learn_thresholds(design(), log(0, 1.0, mismatch=0.3, rows=2000), false_alarms="1 per 200 rows")
+    assert exact.ranges is not None
+    assert exact.ranges.rates is not None
+    assert wrong.ranges is not None
+    assert wrong.ranges.rates is not None
+    assert exact.ranges.rates.shape == (1, len(exact.levels))
+    assert exact.ranges.rates.max() < 0.5
+    assert wrong.ranges.rates.min() > 0.6
+    faulty = log(5, 5.0, fault=0.15, mismatch=0.0)
+    as_before = replace(exact, ranges=exact.ranges._replace(rates=None))
+    alarmed = [
+        (obsynth.run_on_data(design(), faulty, monitor=obsynth.online_monitor(design(), "learned", normal=each)))
+        .table["alarm"].ne("").to_numpy()
+        for each in (exact, as_before)
+    ]  # fmt: skip
+    assert not alarmed[0][:FAULT_AT].any()
+    delays = [int(rows[FAULT_AT:].argmax()) for rows in alarmed]
+    assert 2 * delays[0] < delays[1]
 
 
 def test_within_the_range_nothing_changes_and_a_large_fault_beyond_it_alarms_with_a_note() -> None:

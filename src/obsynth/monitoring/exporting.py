@@ -67,6 +67,7 @@ class LearnedMonitorInC:
         """Return the declaration of the monitor's structure."""
         model = self.learned.statistics.model
         m, width = model.channels, max(len(self.learned.statistics.estimates), 1)
+        inputs = 0 if self.learned.ranges is None else self.learned.ranges.inputs
         return [
             "typedef struct {",
             "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
@@ -83,8 +84,8 @@ class LearnedMonitorInC:
             f"    REAL scores[{max(AGES) * 2 * width}];",
             f"    REAL repeated[{max(self.outputs, 1)}];",
             f"    long equal[{max(self.outputs, 1)}];",
-            f"    REAL raised[{max(AGES)}];",
-            "    REAL raised_now;",
+            f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
+            f"    REAL raised_now[{max(inputs, 1)}];",
             "    int at, quiet, to_wait;",
             "    long taken;",
             f"}} {prefix}_monitor;",
@@ -109,6 +110,7 @@ class LearnedMonitorInC:
         powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
         nothing = np.zeros(0)
         middle, half = (nothing, nothing) if learned.ranges is None else learned.ranges.middle_and_half()
+        rates = None if learned.ranges is None else learned.ranges.rates
         sizes = {
             "CHANNELS": model.channels,
             "ORDER": order,
@@ -122,6 +124,7 @@ class LearnedMonitorInC:
             "MONITOR_SETTLING": learned.settling,
             "MONITOR_OUTPUTS": self.outputs,
             "MONITOR_INPUTS": len(middle),
+            "MONITOR_STATISTICS": len(learned.levels),
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
@@ -145,6 +148,7 @@ class LearnedMonitorInC:
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,
             "monitor_middle": middle[None],
             "monitor_half": np.where(np.isfinite(half), half, 0.0)[None],
+            "monitor_rates": np.ones((len(middle), len(learned.levels))) if rates is None else rates,
             "monitor_innovation": np.array([[learned.innovation]]),
         }
         faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}

@@ -26,10 +26,12 @@ static void monitor_reset(PREFIX_monitor *m)
         m->repeated[i] = 0;
         m->equal[i] = 0;
     }
-    for (i = 0; i < OLDEST; i++) {
+    for (i = 0; i < OLDEST * MONITOR_INPUTS; i++) {
         m->raised[i] = 1;
     }
-    m->raised_now = 1;
+    for (i = 0; i < MONITOR_INPUTS; i++) {
+        m->raised_now[i] = 1;
+    }
     m->at = 0;
     m->taken = 0;
     m->to_wait = 0;
@@ -54,17 +56,34 @@ static void monitor_unrepeat(PREFIX_monitor *m, REAL *y)
     }
 }
 
-/* By which factor levels are raised in a row, as an input is beyond the range that was learned. */
+/* How many times the half of its range each input of a row is from the middle: one within what was learned. */
 static void monitor_range(PREFIX_monitor *m, const REAL *u)
 {
     int i;
-    m->raised_now = 1;
     for (i = 0; i < MONITOR_INPUTS; i++) {
         REAL away = ABS(u[i] - monitor_middle[0][i]);
-        if (monitor_half[0][i] > 0 && away > monitor_half[0][i]) {
-            REAL share = away / monitor_half[0][i];
-            m->raised_now = share * share > m->raised_now ? share * share : m->raised_now;
+        m->raised_now[i] = monitor_half[0][i] > 0 && away > monitor_half[0][i] ? away / monitor_half[0][i] : 1;
+    }
+}
+
+/* The levels, whose roots are raised by the share of them that follows each input. */
+static void monitor_raise(const PREFIX_monitor *m, REAL *levels)
+{
+    REAL farthest[MONITOR_INPUTS + 1];
+    int i, j;
+    for (i = 0; i < MONITOR_INPUTS; i++) {
+        farthest[i] = 1;
+        for (j = 0; j < OLDEST; j++) {
+            REAL far = m->raised[j * MONITOR_INPUTS + i];
+            farthest[i] = far > farthest[i] ? far : farthest[i];
         }
+    }
+    for (j = 0; j < MONITOR_STATISTICS; j++) {
+        REAL root = 1;
+        for (i = 0; i < MONITOR_INPUTS; i++) {
+            root += (farthest[i] - 1) * monitor_rates[i][j];
+        }
+        levels[j] = monitor_levels[0][j] * (root * root);
     }
 }
 
@@ -348,7 +367,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     REAL changes[MONITOR_WIDTH];
     REAL ratio, statistic;
     REAL best = -1;
-    REAL raised = 1;
+    REAL levels[MONITOR_STATISTICS];
     int changed = -1;
     int which = 0;
     int is_said = 1;
@@ -391,16 +410,19 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     is_said = is_whole || (innovation >= 0 && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
-    m->raised[m->at] = m->raised_now;
-    m->raised_now = 1;
+    for (i = 0; i < MONITOR_INPUTS; i++) {
+        m->raised[m->at * MONITOR_INPUTS + i] = m->raised_now[i];
+        m->raised_now[i] = 1;
+    }
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;
     /* Without evidence of its own a sample with fewer outputs is decided by the rows before it. */
     if (known || (deciding && innovation >= 0 && m->taken > MONITOR_SETTLING)) {
-        statistic = square(m->white + m->at * CHANNELS) / monitor_levels[0][0];
+        monitor_raise(m, levels);
+        statistic = square(m->white + m->at * CHANNELS) / levels[0];
         for (i = 0; i < MEANS; i++) {
-            ratio = square(m->means + i * CHANNELS) * monitor_sizes[0][i] / monitor_levels[0][1 + i];
+            ratio = square(m->means + i * CHANNELS) * monitor_sizes[0][i] / levels[1 + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
         for (i = 0; i < SHAPES; i++) {
@@ -409,24 +431,20 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
                 best = ratio;
                 which = i;
             }
-            ratio /= monitor_levels[0][1 + MEANS + i];
+            ratio /= levels[1 + MEANS + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
         changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
             REAL away = beyond(shown[i] - monitor_centres[0][i], monitor_bands[0][i]);
-            ratio = changes[i] / monitor_levels[0][1 + MEANS + SHAPES + i];
+            ratio = changes[i] / levels[1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
             if (covariance != NULL) {
                 ratio = away * away / covariance[i * (MONITOR_WIDTH + 1)];
-                ratio /= monitor_levels[0][1 + MEANS + SHAPES + MONITOR_ESTIMATES + i];
+                ratio /= levels[1 + MEANS + SHAPES + MONITOR_ESTIMATES + i];
                 statistic = ratio <= statistic ? statistic : ratio;
             }
         }
-        for (i = 0; i < OLDEST; i++) {
-            raised = m->raised[i] > raised ? m->raised[i] : raised;
-        }
-        statistic /= raised;
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
     }

@@ -1,8 +1,9 @@
 """Ranges of inputs and outputs in rows that thresholds were learned from, and what is said of rows beyond them.
 
-The error of a model grows with the distance of an input from where it was learned: at least in proportion, so that
-statistics, which are squares, grow with the square.  Levels are raised by that square while an input is beyond its
-range, and for as long as statistics look back.  Outputs raise nothing, as faults move them: they are only named.
+The error of a model grows with the distance of an input from where it was learned.  While an input is beyond its
+range, and for as long as statistics look back, the root of each level is raised by the share of it that follows the
+input (`range_rates`), in proportion to the distance: by nothing where the logs say that there is no such error, in
+proportion where they cannot say.  Outputs raise nothing, as faults move them: they are only named.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ class LearnedRanges(NamedTuple):
     low: FloatArray
     high: FloatArray
     point: FloatArray  # what makes deviations absolute
+    rates: FloatArray | None = (
+        None  # ``(nu, k)``: shares of the root of each level that follow an input; by default one
+    )
 
     def middle_and_half(self) -> tuple[FloatArray, FloatArray]:
         """Return the middle ``(nu,)`` of the range of each input and half of its width, infinite where an input was
@@ -43,11 +47,23 @@ class LearnedRanges(NamedTuple):
         known = np.isfinite(half) & (half > 0.0)
         return np.where(known, middle, 0.0), np.where(known, half, np.inf)
 
-    def raised(self, inputs: FloatArray) -> float:
-        """Return by which factor levels are raised at ``inputs (nu,)``: one within the range."""
+    def distances(self, inputs: FloatArray) -> FloatArray:
+        """Return how far ``inputs (..., nu)`` are from the middle of their ranges, in halves of these, with signs."""
         middle, half = self.middle_and_half()
-        shares = np.abs(inputs - middle) / half
-        return float(np.max(np.where(shares > 1.0, shares, 1.0), initial=1.0)) ** 2
+        return np.asarray((inputs - middle) / half)
+
+    def beyond_by(self, inputs: FloatArray) -> FloatArray:
+        """Return how many times the half of its range each of ``inputs (nu,)`` is from its middle: one within."""
+        shares = np.abs(self.distances(inputs))
+        return np.asarray(np.where(shares > 1.0, shares, 1.0))
+
+    def factors(self, beyond_by: FloatArray, count: int) -> FloatArray:
+        """Return by which factor each of so many levels is raised ``(count,)``, where inputs are or have been so many
+        halves of their ranges from the middle, ``beyond_by (nu,)``."""
+        away, rates = beyond_by - 1.0, self.rates
+        if rates is None:
+            rates = np.ones((len(away), count))
+        return np.asarray((1.0 + sum((far * own for far, own in zip(away, rates, strict=True)), np.zeros(count))) ** 2)
 
     def beyond(self, deviations: FloatArray, before: FloatArray) -> NDArray[np.bool_]:
         """Return in which rows ``(n, nu + ny)``, after one ``before``, each signal is beyond its range by so much that
@@ -69,9 +85,11 @@ class LearnedRanges(NamedTuple):
         """Return what `as_dict` described."""
         names, inputs = tuple(map(str, data["names"])), int(data["inputs"])
         low, high, point = (np.asarray(data[name], dtype=np.float64) for name in ("low", "high", "point"))
-        if not (low.shape == high.shape == point.shape == (len(names),) and 0 <= inputs <= len(names)):
+        rates = None if data.get("rates") is None else read_only(np.asarray(data["rates"], dtype=np.float64))
+        fits = low.shape == high.shape == point.shape == (len(names),) and 0 <= inputs <= len(names)
+        if not (fits and (rates is None or (rates.ndim == 2 and len(rates) == inputs))):
             raise ValueError("its ranges do not fit together")
-        return cls(names, inputs, read_only(low), read_only(high), read_only(point))
+        return cls(names, inputs, read_only(low), read_only(high), read_only(point), rates)
 
 
 def ranges_of_rows(signals: LogSignals, deviations: FloatArray, inputs: int) -> LearnedRanges:
@@ -146,11 +164,14 @@ class RowsBeyond:
             if i >= ranges.inputs:
                 yield text + "no level is raised for an output, as a fault may be its cause."
                 continue
-            factor = max(abs(self._low[i] - middle[i]), abs(self._high[i] - middle[i])) / half[i]
-            if factor <= 1.0:
+            distance = max(abs(self._low[i] - middle[i]), abs(self._high[i] - middle[i])) / half[i]
+            if distance <= 1.0:
                 yield text + "nothing is known of its effect, and alarms then may be of the model."
                 continue
+            rates = np.ones(1) if ranges.rates is None else ranges.rates[i]
+            least, most = (f"{(1.0 + float(rate) * (distance - 1.0)) ** 2:.3g}" for rate in (rates.min(), rates.max()))
             yield text + (
-                f"levels are up to {factor**2:.3g} times as high there, and {max(AGES) - 1} rows longer. Smaller "
-                "faults are missed: add a normal log with such values."
+                f"levels are up to {most if least == most else f'{least} (the least) to {most} (the largest)'} times "
+                f"as high there, and {max(AGES) - 1} rows longer, as far as the normal logs do not exclude errors of "
+                "the model that grow with it. Smaller faults are missed: add a normal log with such values."
             )

@@ -48,7 +48,7 @@ class LearnedState(NamedTuple):
     before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
     scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
     effects: EffectState = NO_EFFECTS  # of faults and sensors on the residuals
-    raised: FloatArray = NOTHING  # ``(ages,)``: factors of the levels by the inputs of rows, latest last
+    raised: FloatArray = NOTHING  # ``(ages, nu)``: how far beyond their ranges the inputs of rows are, latest last
 
 
 class LearnedRule(Rule):
@@ -93,8 +93,9 @@ class LearnedRule(Rule):
         model = self._model
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
         effects = NO_EFFECTS if self.effects is None else self.effects.init()
+        inputs = 0 if self._ranges is None else self._ranges.inputs
         state = LearnedState(
-            np.tile(model.mean, (model.order, 1)), white, means, effects=effects, raised=np.ones(max(AGES))
+            np.tile(model.mean, (model.order, 1)), white, means, effects=effects, raised=np.ones((max(AGES), inputs))
         )
         if self._walk is None:
             return state
@@ -147,7 +148,7 @@ class LearnedRule(Rule):
             changes = self._changes(state, self._bands)
             squares = self._squares(sample.observation)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
-            values = values / (self.learned.levels * state.raised.max())
+            values = values / (self.learned.levels * self._factors(state))
         values = np.where(np.isnan(values), np.inf, values)
         # Faults are compared without what their slow offsets explain: each has its own.
         fault = (
@@ -170,9 +171,18 @@ class LearnedRule(Rule):
         )
 
     def _raised(self, before: FloatArray, sample: Sample, missing: int) -> FloatArray:
-        """Return the factors of the levels ``(ages,)`` with that of a sample, after so many that are missing."""
-        now = 1.0 if self._ranges is None or sample.inputs is None else self._ranges.raised(sample.inputs)
-        return np.concatenate([before, np.ones(min(missing, max(AGES))), [now]])[-max(AGES) :]
+        """Return how far inputs are beyond their ranges ``(ages, nu)`` with a sample, after some that are missing."""
+        if self._ranges is None:
+            return before
+        now = np.ones(self._ranges.inputs) if sample.inputs is None else self._ranges.beyond_by(sample.inputs)
+        gone = np.ones((min(missing, max(AGES)), len(now)))
+        return np.vstack([before, gone, now])[-max(AGES) :]
+
+    def _factors(self, state: LearnedState) -> FloatArray | float:
+        """Return by which factor each level is raised by the inputs of the rows that statistics look back to."""
+        if self._ranges is None:
+            return 1.0
+        return self._ranges.factors(state.raised.max(axis=0, initial=1.0), len(self.learned.levels))
 
     def _scored(self, state: LearnedState, observation: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""

@@ -42,6 +42,7 @@ from obsynth.monitoring.thresholds.normal_notes import (
     notes_of_starts,
 )
 from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
+from obsynth.monitoring.thresholds.range_rates import range_rates
 from obsynth.monitoring.thresholds.sensor_drifts import (
     DRIFT_ROWS,
     LIMIT_ROWS,
@@ -218,6 +219,11 @@ def learn_thresholds(
     )
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     inputs = logs.rows[output.numbers, 1 : 1 + signals.inputs]
+    ranges = ranges_of_rows(signals, signals.deviations(logs.rows[np.unique(output.numbers)]), known_inputs)
+    distances = ranges.distances(signals.deviations(logs.rows[output.numbers])[:, :known_inputs])
+    rates = range_rates(
+        distances, white, learned.statistics, learned.levels, output.scores, learned.centres, options["logs"]
+    )
     divided = divided_at_starts(design.observer, output.scores if learned.statistics.estimates else None)
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
     return replace(
@@ -233,7 +239,7 @@ def learn_thresholds(
         drift_limits=_drift_limits(design, lambda: new_run(sizes, starts), logs, offsets, learned)
         if drifts is None and len(logs.ends) == 1
         else {},
-        ranges=ranges_of_rows(signals, signals.deviations(logs.rows[np.unique(output.numbers)]), known_inputs),
+        ranges=ranges._replace(rates=rates),
     )
 
 
