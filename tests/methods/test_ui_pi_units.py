@@ -193,3 +193,37 @@ def test_a_fast_state_that_no_output_shows_does_not_hurry_the_default(dt: float,
     )  # fmt: skip
     decays = [ui_pi_observer(plant).certificate.claims["decay"] for plant in (alone, beside)]
     assert decays[1] < 1.3 * decays[0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "turn"),
+    [
+        # Rows of C that are orthogonal in the plant's own units, and not as written.
+        ({"A": -0.4 * np.eye(2), "C": [[1.0, 0.5], [2.0, -1.5]], "Bf": [[2.0], [0.0]], "Df": [[1.5], [1.0]]}, 0.7),
+        # All modes end within a few samples.
+        (
+            {
+                "E": np.diag([1.0, 0.0]),
+                "A": [[0.0, -0.2], [0.0, 0.2]],
+                "C": [[0.5, -1.0], [2.5, 0.5]],
+                "Bf": [[-0.5], [0.0]],
+            },
+            1.2,
+        ),
+    ],
+)
+def test_a_default_is_as_fast_in_other_coordinates(rows: dict[str, object], turn: float) -> None:
+    given = {name: np.array(value, dtype=float) for name, value in rows.items()}
+    change = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag([0.6, 1.5])
+    own = {"E": np.eye(2), **given}
+    turned = own | {
+        "E": np.linalg.solve(change, own["E"] @ change) if "E" in given else np.eye(2),
+        "A": np.linalg.solve(change, own["A"] @ change),
+        "C": own["C"] @ change,
+        "Bf": np.linalg.solve(change, own["Bf"]),
+    }
+    decays = [
+        ui_pi_observer(DescriptorSystem(**plant, Dw=0.1 * np.eye(2), dt=1.0)).certificate.claims["decay"]
+        for plant in (own, turned)
+    ]
+    assert decays[0] == pytest.approx(decays[1], rel=0.2)

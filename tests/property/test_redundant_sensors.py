@@ -131,3 +131,16 @@ def test_nearly_equal_sensors_are_merged_where_the_stated_decay_is_reached():
     both = obsynth.DescriptorSystem(A=a, C=rows, Bf=bf, Dw=np.diag([0.1, 0.1]))
     alone, more = (obsynth.pd_observer(plant, decay=0.3) for plant in (one, both))
     assert noise_of(more) <= 0.75 * noise_of(alone)
+
+
+def test_a_scaled_copy_that_differs_in_the_last_digit_takes_the_place_of_no_other_sensor():
+    first = np.array([1.4528265468366863, -0.47477474169790523])
+    other = [0.4472415238205908, -0.9719207939310532]
+    c = np.vstack([first, -2.0 * first, other])
+    c[1, 1] = 0.9495494833958105
+    c[1, 0] = np.nextafter(c[1, 0], 0.0)
+    plant = obsynth.DescriptorSystem(
+        A=[[0.1, -0.4], [0.2, 0.1]], C=c, Bf=[[-2.0], [-0.9]], Bd=[[-0.9], [0.35]], Dw=0.1 * np.eye(3), dt=1.0
+    )
+    assert np.allclose(merged_outputs(plant).plant.C, c[[0, 2]], rtol=1e-12)
+    assert obsynth.ui_pi_observer(plant).report.passed

@@ -21,6 +21,10 @@ from obsynth.numerics.spectra import eigenvalues
 #: rounding split lies at about the square root of the unit roundoff from it.
 SAME_MODE = 1e-5
 
+#: Entries below this share of the largest are no links by which states are balanced: units of a plant, which are found
+#: to some 1e-9, may leave so much of products that would be zero.
+LEAST_LINK = 1e-8
+
 
 @dataclass(frozen=True, eq=False)
 class ObservableSplit:
@@ -50,13 +54,16 @@ class ObservableSplit:
         return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
 
 
-def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *, dt: float) -> ObservableSplit:
-    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``.
+def observable_split(
+    f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *, dt: float, exact_rows: int = 0
+) -> ObservableSplit:
+    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``; the last ``exact_rows`` of F are no
+    products.
 
     A stable mode that is fixed by the zeros of the plant's pencil, but that the pair shows, is left where it shows: it
     decays with or without a gain.  An unstable one cannot be left, and is refused."""
     n = f.shape[0]
-    units = _balancing(f, c)
+    units = _balancing(f, c, exact_rows)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
     size = max(largest_singular_value(work_f), largest_singular_value(work_c)) if n else 1.0
     waiting: list[complex] = []
@@ -107,7 +114,7 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
     return np.asarray(directions[:, lengths > RANK_TOLERANCE])
 
 
-def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
+def _balancing(f: FloatArray, c: FloatArray, exact_rows: int) -> FloatArray:
     """Return state factors that make entries of F, and of C, alike; F's size is free, as it may be reducible."""
     n = f.shape[0]
     problem = LogBalance(n + 2)
@@ -115,9 +122,13 @@ def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
     links = np.where(np.eye(n, dtype=bool), 0.0, f)
     # All outputs together: which combinations of them are looked at must not matter.
     output_sizes = np.linalg.norm(c, axis=0, keepdims=True)
-    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, output_sizes))
-    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
-    problem.add(np.where(output_sizes > floor_c, output_sizes, 0.0), range(n + 1, n + 2), states)
+    largest_f, largest_c = (float(np.max(np.abs(part), initial=0.0)) for part in (f, output_sizes))
+    floors = np.full((n, 1), LEAST_LINK * largest_f)
+    floors[n - exact_rows :] = CANCELLATION_TOLERANCE * largest_f
+    problem.add(np.where(np.abs(links) > floors, f, 0.0), states, states, signs=(-1, 1), common=n)
+    problem.add(
+        np.where(output_sizes > CANCELLATION_TOLERANCE * largest_c, output_sizes, 0.0), range(n + 1, n + 2), states
+    )
     for state in states:
         problem.wish(state, 0.0)
     return np.asarray(np.exp2(problem.solve()[:n]))

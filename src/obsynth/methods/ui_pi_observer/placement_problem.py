@@ -98,7 +98,7 @@ def placement_problem(
         # Another U may have other unobservable modes than the plant's pencil.
         n = len(f)
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
-    split = observable_split(f, c, fixed_modes, dt=scaled.dt)
+    split = observable_split(f, c, fixed_modes, dt=scaled.dt, exact_rows=model.order)
     return PlacementProblem(
         plant=scaled,
         model=model,
@@ -152,6 +152,9 @@ def _own_rate(plant: DescriptorSystem, split: ObservableSplit) -> float:
         if speeds.size and (plant.dt > 0.0 or np.max(speeds) > INTEGRATOR_SCATTER * size):
             median = float(np.median(speeds))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
+        if plant.dt > 0.0 and values.size and np.all(np.abs(values) <= DEAD_BEAT):
+            # A plant that stops within its order of samples; those of the pair depend on coordinates and sensors.
+            return MOST_PER_SAMPLE / plant.dt
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
 
 

@@ -108,7 +108,8 @@ def _independent(output_rows: FloatArray) -> tuple[list[int], FloatArray, bool]:
     units = output_rows[moving] / lengths[moving, None]
     count = rounding_rank(units) if len(moving) else 0
     picked = pivot_columns(written_matrix(output_rows).transpose()) if count else []
-    exact = len(picked) == count
+    # As written a copy may differ from its sensor in the last digit, and be taken in place of another one.
+    exact = len(picked) == count and (not count or rounding_rank(output_rows[picked] / lengths[picked, None]) == count)
     if not exact:
         picked = [int(moving[place]) for place in _first_independent(units, count)]
     q = np.zeros((len(output_rows), count))
