@@ -107,7 +107,7 @@ def export(
         From `online_monitor`: one that was learned from rows without faults (``"learned"``; its statistic and alarms
         are those of a run), for ``.c`` and ``.fmu``; or with ``constants``, its thresholds over the tolerances as
         ``<stem>_thresholds_step``, for constants that stay the same; for ``.c`` only.  Of a design over a region in
-        discrete time its guaranteed threshold (``"pointwise"``), for ``.c``.
+        discrete time its guaranteed threshold (``"pointwise"``), for ``.c`` and ``.fmu``.
     precision : {"double", "float"}, optional
         Of the numbers in C; the header of floats bounds what these change for linear observers, and says what was
         measured for nonlinear ones (which takes a C compiler).
@@ -174,7 +174,7 @@ def export(
     )
     numbers = precision or "double"
     if isinstance(design.observer, ScheduledObserver):
-        return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers)
+        return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers, fmi)
     written: ExportedMonitor | None = None if monitor is None else registered("monitor_in_c")(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
@@ -253,33 +253,34 @@ def _write_scheduled(
     warm_up: float | None,
     sample_time: float | None,
     numbers: str,
+    fmi: str | None,
 ) -> tuple[Path, ...]:
-    """Write a scheduled observer as C, or its matrices at the vertices."""
-    if suffix == ".fmu":
-        raise SpecError(
-            "A design over a region is exported as C (.c) or as its matrices at the vertices (.mat, .npz); FMUs "
-            "hold observers that do not change.",
-            path="path",
-        )
-    if suffix != ".c" and sample_time is not None:
+    """Write a scheduled observer as C or an FMU, or its matrices at the vertices."""
+    arrays = suffix not in (".c", ".fmu")
+    if arrays and sample_time is not None:
         raise SpecError(
             "The matrices at the vertices are those of the design: leave sample_time out.", path="sample_time"
         )
-    if suffix != ".c":
+    if arrays:
         return (write_atomically(target, _array_file(scheduled_arrays(design), design, suffix)),)
     if design.scheduled[1].dt == 0.0:
         raise SpecError(
             "The observer over a region is continuous in time, and solves linear equations at each row: it runs on "
-            "logs (obsynth.run_on_data), and C is written of those for plants in discrete time (dt).",
+            "logs (obsynth.run_on_data); C and FMUs are written of those for plants in discrete time (dt).",
             path="path",
         )
     if sample_time is not None or numbers != "double":
         raise SpecError(
-            "C of a design over a region is in doubles, at the sample time of its plant: leave sample_time and "
+            "A design over a region is written in doubles, at the sample time of its plant: leave sample_time and "
             "precision out.",
             path="precision" if sample_time is None else "sample_time",
         )
     written = None if monitor is None else registered("monitor_in_c")(monitor, design)
+    if suffix == ".fmu":
+        from obsynth.exporting.fmu.archive import write_fmu
+
+        options: Any = {"sample_time": None, "thresholds": thresholds, "warm_up": warm_up, "monitor": written}
+        return (write_fmu(design, target, version=fmi or "2.0", **options),)
     alarms = scheduled_alarms(design.scheduled[1], thresholds, warm_up, written)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declared = (in_precision(text, numbers) for text in scheduled_c_texts(design, prefix, header.name, alarms))

@@ -12,18 +12,21 @@ from importlib.resources import files
 from pathlib import Path
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import ExportedMonitor, linear_alarms
+from obsynth.exporting.alarms import ExportedMonitor, linear_alarms, scheduled_alarms
 from obsynth.exporting.c_precision import in_precision
+from obsynth.exporting.c_scheduled import scheduled_c_texts
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import build_description, model_description
 from obsynth.exporting.fmu.layout import PREFIX, layout_header
-from obsynth.exporting.fmu.signals import FmuSignals, signals_of_dae, signals_of_linear
+from obsynth.exporting.fmu.signals import FmuSignals, signals_of_dae, signals_of_linear, signals_of_scheduled
 from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.files.outputs import working_folder, write_atomically
 from obsynth.observers.nonlinear.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.design import ObserverDesign, unverified_mark
+from obsynth.results.gain_set_writing import gain_set_digest
 
 #: Date of every entry, so that archives of equal content are equal: the first day that a zip file can hold.
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)
@@ -81,6 +84,11 @@ def _contents(
         alarms = dae_alarms(design, thresholds, warm_up, monitor)
         text, declared, digest = dae_c_texts(design, PREFIX, header, alarms, outliers)
         return signals_of_dae(design, alarms), (text, declared), digest
+    if isinstance(design.observer, ScheduledObserver):
+        plant, observer = design.scheduled
+        alarms = scheduled_alarms(observer, thresholds, warm_up, monitor)
+        source, declared = (in_precision(text, "double") for text in scheduled_c_texts(design, PREFIX, header, alarms))
+        return signals_of_scheduled(plant, observer, alarms), (source, declared), gain_set_digest(design)
     realisation = Realisation.of(design, sample_time)
     if realisation.observer.dt == 0.0:
         raise SpecError(

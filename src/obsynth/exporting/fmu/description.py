@@ -96,8 +96,10 @@ def fmu_variables(signals: FmuSignals) -> Iterator[FmuVariable]:
     """Yield the variables in the order of their value references, which are 0, 1, 2, ..."""
     yield _variable("time", "independent", "continuous", "time", unit="s")
     for name, signal in zip(signals.inputs, signals.input_signals, strict=True):
-        start, unit = signals.points.get(signal, 0.0), signals.units.get(signal, "")
-        yield _variable(name, "input", "discrete", f"signal {signal}", start=start, unit=unit)
+        start = signals.parameters.get(name, signals.points.get(signal, 0.0))
+        kind = "scheduling parameter" if name in signals.parameters else "signal"
+        unit = signals.units.get(signal, "")
+        yield _variable(name, "input", "discrete", f"{kind} {signal}", start=start, unit=unit)
     for output in signals.outputs:
         yield _variable(output.name, "output", "discrete", output.description, initial="calculated", unit=output.unit)
     units = {output.name: output.unit for output in signals.outputs}

@@ -6,6 +6,7 @@ from obsynth.exporting.c_source import comment, integer_table
 from obsynth.exporting.fmu.description import fmu_variables
 from obsynth.exporting.fmu.signals import FmuSignals
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.design import ObserverDesign
 
 #: Prefix of every name in the C of the observer inside an FMU.
@@ -16,7 +17,10 @@ def layout_header(design: ObserverDesign, signals: FmuSignals, token: str) -> st
     """Return ``layout.h``: sizes, start values, and how one sample is taken."""
     numbers = [variable for variable in fmu_variables(signals) if variable.is_number]  # by value reference
     starts = [variable.start_and_unit.get("start", "0.0") for variable in numbers]
-    input_points = [signals.point_index(signal if signals.points else None) for signal in signals.input_signals]
+    input_points = [
+        signals.point_index(signal if signals.points and name not in signals.parameters else None)
+        for name, signal in zip(signals.inputs, signals.input_signals, strict=True)
+    ]
     output_points = [signals.point_index(output.signal) for output in signals.outputs]
     sizes = {
         "N_IN": len(signals.inputs),
@@ -24,7 +28,12 @@ def layout_header(design: ObserverDesign, signals: FmuSignals, token: str) -> st
         "N_POINT": len(signals.points),
         "N_WATCHED": len(signals.alarms.levels),
     }
-    body = _dae_sample(design, signals) if isinstance(design.observer, DAEObserver) else _linear_sample(design, signals)
+    if isinstance(design.observer, DAEObserver):
+        body = _dae_sample(design, signals)
+    elif isinstance(design.observer, ScheduledObserver):
+        body = _scheduled_sample(design, signals)
+    else:
+        body = _linear_sample(design, signals)
     return "\n".join(
         [
             comment("Sizes and start values of this observer, written by obsynth."),
@@ -61,19 +70,46 @@ def layout_header(design: ObserverDesign, signals: FmuSignals, token: str) -> st
 
 def _linear_sample(design: ObserverDesign, signals: FmuSignals) -> list[str]:
     """Return the body that hands one sample to the linear observer; empty groups are no arguments there."""
-    kinds = [output.name.partition("[")[0] for output in signals.outputs]
     known = len(signals.inputs) - len(design.plant.output_names)
     counts = (("in", known), (f"in + {known}", len(signals.inputs) - known))
-    groups, place = [], 0
-    for kind in ("xhat", "fhat", "r"):
-        groups.append((f"out + {place}", kinds.count(kind)))
-        place += kinds.count(kind)
+    groups, place = _output_groups(signals)
     arguments = ", ".join(text for text, count in (*counts, *groups) if count)
     return [
         f"    int failed = {PREFIX}_step(memory, {arguments});",
         *_monitor_lines(signals, place),
         "    return failed;",
     ]
+
+
+def _scheduled_sample(design: ObserverDesign, signals: FmuSignals) -> list[str]:
+    """Return the body that hands one sample to a scheduled observer, with an input that is one in every row."""
+    plant, observer = design.scheduled
+    known, names = len(signals.inputs) - len(plant.output_names), observer.input_names
+    groups, place = _output_groups(signals)
+    arguments = ", ".join(text for text, count in groups if count)
+    given, lines = "in", []
+    if plant.shift in names:
+        given, at = "u", names.index(plant.shift)
+        lines = [f"    double u[{len(names)}];", f"    memcpy(u, in, {at} * sizeof *u);", f"    u[{at}] = 1.0;"]
+        lines.append(f"    memcpy(u + {at + 1}, in + {at}, {known - at} * sizeof *u);")
+    return [
+        "    int failed;",
+        *lines,
+        f"    failed = {PREFIX}_step(memory, {given}, in + {known}, {arguments});",
+        f"    out[{place}] = memory->status;",
+        *_monitor_lines(signals, place + 1),
+        "    return failed;",
+    ]
+
+
+def _output_groups(signals: FmuSignals) -> tuple[list[tuple[str, int]], int]:
+    """Return where states, faults and residuals are written, with their numbers; and how many there are."""
+    kinds = [output.name.partition("[")[0] for output in signals.outputs]
+    groups, place = [], 0
+    for kind in ("xhat", "fhat", "r"):
+        groups.append((f"out + {place}", kinds.count(kind)))
+        place += kinds.count(kind)
+    return groups, place
 
 
 def _monitor_lines(signals: FmuSignals, place: int) -> list[str]:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from obsynth.errors import counted
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
+
+#: Name of the output that says what a row of a scheduled observer was.
+STATUS = "status"
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,10 @@ class Output:
 
 @dataclass(frozen=True)
 class FmuSignals:
-    """Inputs, outputs, operating points and alarms of an FMU, in the order of its values."""
+    """Inputs, outputs, operating points and alarms of an FMU, in the order of its values.
+
+    ``parameters``: start values of inputs that are scheduling parameters, which have no operating point.
+    """
 
     inputs: tuple[str, ...]
     input_signals: tuple[str, ...]
@@ -32,6 +41,7 @@ class FmuSignals:
     alarms: Alarms
     units: Mapping[str, str]
     dt: float
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def point_index(self, signal: str | None) -> int:
         """Return the position of a signal among the operating points, -1 for none."""
@@ -41,8 +51,45 @@ class FmuSignals:
 def signals_of_linear(realisation: Realisation, alarms: Alarms) -> FmuSignals:
     """Return the signals of a linear observer; fault estimates and residuals may be watched."""
     plant, observer = realisation.design.plant, realisation.observer
-    biases = getattr(plant, "sensor_faults", ())
-    units, operating_point = dict(plant.units), dict(getattr(plant, "operating_point", {}))
+    outputs, units = _estimates(plant, observer)
+    outputs += _monitor_outputs(alarms)
+    points = _points(plant, (*realisation.inputs, *observer.state_names, *observer.fault_names))
+    inputs = _distinct(observer.input_names, observer.output_names)
+    return FmuSignals(inputs, realisation.inputs, tuple(outputs), points, alarms, units, observer.dt)
+
+
+def signals_of_scheduled(plant: PolytopicSystem, observer: ScheduledObserver, alarms: Alarms) -> FmuSignals:
+    """Return the signals of a scheduled observer: its parameters are inputs, and the status of a row is an output."""
+    held, known = observer.scheduling, observer.input_names[: observer.inputs]
+    known = tuple(name for name in known if name != plant.shift)
+    read = observer.input_names[observer.inputs :]
+    outputs, units = _estimates(plant, observer)
+    listed = "0: claimed, 1: warm-up, 2: a sample is missing, 3: recovering from one"
+    outputs.append(Output(STATUS, None, "", f"{listed}, 4: a parameter is outside the region, or was until recently"))
+    outputs += _monitor_outputs(alarms)
+    points = _points(plant, (*known, *observer.output_names, *observer.state_names, *observer.fault_names))
+    inputs = _distinct((*known, *read), observer.output_names)
+    named = inputs[len(known) : len(known) + len(read)]
+    return FmuSignals(
+        inputs,
+        (*known, *held.names, *observer.output_names),
+        tuple(outputs),
+        points,
+        alarms,
+        {**held.units, **units},
+        observer.dt,
+        dict(zip(named, observer.middle.tolist(), strict=True)),
+    )
+
+
+def _points(plant: Any, signals: Sequence[str]) -> dict[str, float]:
+    operating_point = dict(getattr(plant, "operating_point", {}))
+    return {name: float(operating_point.get(name, 0.0)) for name in dict.fromkeys(signals)}
+
+
+def _estimates(plant: Any, observer: Any) -> tuple[list[Output], dict[str, str]]:
+    """Return the outputs of an observer, and the units of signals."""
+    biases, units = getattr(plant, "sensor_faults", ()), dict(plant.units)
     outputs = [
         Output(f"xhat[{name}]", name, units.get(name, ""), _delayed(f"estimate of {name}", delay))
         for name, delay in zip(observer.state_names, observer.state_delays, strict=True)
@@ -57,11 +104,7 @@ def signals_of_linear(realisation: Realisation, alarms: Alarms) -> FmuSignals:
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
     ]
     outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}") for name in observer.residual_names]
-    outputs += _monitor_outputs(alarms)
-    signals = (*realisation.inputs, *observer.state_names, *observer.fault_names)
-    points = {name: float(operating_point.get(name, 0.0)) for name in dict.fromkeys(signals)}
-    inputs = _distinct(observer.input_names, observer.output_names)
-    return FmuSignals(inputs, realisation.inputs, tuple(outputs), points, alarms, units, observer.dt)
+    return outputs, units
 
 
 def _monitor_outputs(alarms: Alarms) -> list[Output]:
