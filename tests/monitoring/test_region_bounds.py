@@ -36,12 +36,32 @@ def _random_plant(seed: int, count: int) -> PolytopicSystem:
     return PolytopicSystem(plant=plant, scheduling={name: [-1, 1] for name in names})
 
 
+def _turning_plant(seed: int) -> PolytopicSystem:
+    """Return a plant whose fault turns with the parameter, with three noisy outputs."""
+    rng = np.random.default_rng([seed, 77])
+    middle, turn = rng.standard_normal((3, 3)), 0.1 * rng.standard_normal((3, 3))
+    middle *= 0.75 / np.abs(np.linalg.eigvals(middle)).max()
+    fault = rng.standard_normal(3), 0.5 * rng.standard_normal(3)
+    plant = {
+        "A": [[f"{middle[i, j]:.6f} + {turn[i, j]:.6f} * v" for j in range(3)] for i in range(3)],
+        "Bf": [[f"{fault[0][i]:.6f} + {fault[1][i]:.6f} * v"] for i in range(3)], "C": np.eye(3).tolist(),
+        "Bd": rng.uniform(0.2, 1.0, (3, 1)).tolist(), "dt": 1.0, "Bw": np.zeros((3, 3)).tolist(),
+        "Dw": np.diag([0.01, 0.02, 0.015]).tolist(),
+    }  # fmt: skip
+    return PolytopicSystem(plant=plant, scheduling={"v": [-1, 1]})
+
+
 def _simulated(
-    design: ObserverDesign, course: FloatArray, d: FloatArray, noise: FloatArray, fault: FloatArray | None = None
+    design: ObserverDesign,
+    course: FloatArray,
+    d: FloatArray,
+    noise: FloatArray,
+    fault: FloatArray | None = None,
+    start: FloatArray | None = None,
 ) -> FloatArray:
     """Return residuals ``(steps, nr)`` of the observer that runs beside the plant at parameters ``(steps, p)``."""
     plant, observer = design.scheduled
-    x, state, rows = np.zeros(plant.nx), observer.init(), []
+    x, state, rows = np.zeros(plant.nx) if start is None else start, observer.init(), []
     for k, parameters in enumerate(course):
         own = plant.at(parameters.tolist())
         y = own.C @ x + own.Dw @ noise[k]
@@ -110,6 +130,55 @@ def test_no_course_passes_the_threshold_and_some_come_near(seed: int, count: int
 @pytest.fixture(scope="module")
 def design() -> ObserverDesign:
     return obsynth.fault_estimation_filter(_random_plant(0, 1))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_filter_of_faults_that_turn_has_a_threshold_that_some_course_reaches(seed: int) -> None:
+    """The sum of the norms of the responses to each input of each sample is what the threshold bounds."""
+    design, steps, rng = obsynth.fault_estimation_filter(_turning_plant(seed)), 10, np.random.default_rng(seed)
+    assert design.scheduled[1].correction is not None
+    rule: Any = _monitor(design, initial_error=0.0).rule
+
+    def reached(course: FloatArray) -> float:
+        total = 0.0
+        for k in range(steps):
+            for which in range(4):
+                inputs = np.zeros((steps, 4))
+                inputs[k, which] = NOISE if which else D1
+                total += float(np.linalg.norm(_simulated(design, course, inputs[:, :1], inputs[:, 1:])[-1]))
+        return total
+
+    course = rng.choice([-1.0, 1.0], (steps, 1))
+    best = reached(course)
+    for k in reversed(range(steps - 4, steps)):
+        trial = np.where(np.arange(steps)[:, None] == k, -course, course)
+        if (other := reached(trial)) > best:
+            course, best = trial, other
+    assert 0.9 * rule.limit < best <= rule.limit
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 4])
+def test_random_inputs_and_starts_pass_no_row_of_a_filter_of_faults_that_turn(seed: int) -> None:
+    design, rng = obsynth.fault_estimation_filter(_turning_plant(seed)), np.random.default_rng(seed)
+    for size in (0.0, 0.7):
+        rule: Any = _monitor(design, initial_error=size).rule
+        for _ in range(8):
+            course = rng.choice([-1.0, 0.3, 1.0], (25, 1))
+            d, noise = D1 * rng.choice([-1.0, 1.0], (25, 1)), NOISE * rng.choice([-1.0, 1.0], (25, 3))
+            # With E = I and three outputs the error at the start is T x.
+            start = rng.standard_normal(3)
+            start *= size / np.linalg.norm(design.certificate.matrices["tracking"] @ start)
+            norms = np.linalg.norm(_simulated(design, course, d, noise, start=start), axis=1)
+            bounds = np.append(rule.table, np.full(max(25 - len(rule.table), 0), rule.limit))[:25]
+            assert (norms <= bounds).all()
+        if size:
+            assert norms[0] > 0.5 * bounds[0]
+    fault = np.where(np.arange(60) < 40, 0.0, 4.0 * rule.limit / np.linalg.norm(design.scheduled[0].at([0.0]).Bf))
+    none = np.zeros((60, 3))
+    loud = np.linalg.norm(_simulated(design, np.zeros((60, 1)), none[:, :1], none, fault[:, None]), axis=1)
+    assert (loud[42:] > rule.limit).any()
 
 
 def test_random_inputs_raise_no_alarm_and_a_fault_does(design: ObserverDesign) -> None:

@@ -9,6 +9,16 @@ is bounded by the sum of the norms of the columns.  That is convex in the weight
 others fixed: its largest value is at a course of vertices.  The courses of the latest samples are enumerated; what is
 older is bounded in the norm of the certificate, in which errors shrink along every course of as many samples:
 :math:`|e_{k+J}|_P \le c |e_k|_P + \beta`.  The decay is proved again from the stored matrices before it is used.
+
+A filter of faults that turn corrects its states by ``K(mu) r`` with the weights of the sample before.  Its corrected
+errors :math:`\epsilon = e - K r` obey
+
+.. math::
+    \epsilon_{k+1} = (I - K(\mu_k) C) (M(\mu_k) \epsilon_k + B(\mu_k) w_k) - K(\mu_k) D w_{k+1}, \qquad
+    r_{k+1} = C (M(\mu_k) \epsilon_k + B(\mu_k) w_k) + D w_{k+1},
+
+all of which is the mean, with weights ``mu_i^2`` and ``2 mu_i mu_j``, of what it is at pairs of vertices: these are
+the vertices of the same enumeration.
 """
 
 from __future__ import annotations
@@ -18,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from obsynth.analysis.existence.turning_filter import pairs_of_vertices
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model
 from obsynth.monitoring.thresholds.residual_monitor import bounds_of
@@ -46,12 +57,27 @@ MOST_SAMPLES = 64
 
 
 class ErrorsAtVertices(NamedTuple):
-    """The error system at each vertex, every input scaled to at most one."""
+    """The error system at each vertex, every input scaled to at most one.
+
+    ``e+ = M e + B w + K w+`` with the inputs ``w+`` of the next sample; ``r = C e + D w``, or with a first sample
+    of its own ``r+ = C e + D w + F w+``.
+    """
 
     M: FloatArray  # ``(N, n, n)``
     B: FloatArray  # ``(N, n, m)``
+    C: FloatArray  # ``(N or 1, nr, n)``
+    D: FloatArray  # ``(N or 1, nr, m)``
+    K: FloatArray  # ``(N or 1, n, m)``
+    first: FirstSample | None = None
+
+
+class FirstSample(NamedTuple):
+    """What a later output has of the first sample, before any course: the corrected start, and its own residual."""
+
+    start: FloatArray  # ``(n, n)``: from the error at the start
+    start_inputs: FloatArray  # ``(n, m)``: from the inputs of the first sample
     C: FloatArray  # ``(nr, n)``
-    D: FloatArray  # ``(nr, m)``
+    F: FloatArray  # ``(nr, m)``
 
 
 def region_bound(
@@ -95,15 +121,35 @@ def _errors_at_vertices(
             "'learned' with normal=...).",
             path="kind",
         )
-    return ErrorsAtVertices(M, B, C[0], D[0]), model, bounds
+    if observer.correction is not None:
+        return _corrected(M, B, C[0], D[0], observer), model, bounds
+    return ErrorsAtVertices(M, B, C[:1], D[:1], np.zeros((1, *B.shape[1:]))), model, bounds
+
+
+def _corrected(
+    M: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, observer: ScheduledObserver
+) -> ErrorsAtVertices:
+    """Return the corrected errors at pairs of vertices."""
+    K = np.zeros((0,)) if observer.correction is None else observer.correction
+    eye, pairs = np.eye(M.shape[1]), pairs_of_vertices(len(M))
+
+    def means(left: FloatArray, right: FloatArray) -> FloatArray:
+        return np.array([0.5 * (left[i] @ right[j] + left[j] @ right[i]) for i, j in pairs])
+
+    free, same = eye - K @ C, np.array([C] * len(M))
+    middle = np.tensordot(observer.init().weights, K, 1)
+    first = FirstSample(eye - middle @ C, -middle @ D, C, D)
+    corrections = np.array([-0.5 * (K[i] + K[j]) @ D for i, j in pairs])
+    return ErrorsAtVertices(means(free, M), means(free, B), means(same, M), means(same, B), corrections, first)
 
 
 def _require_supported(design: ObserverDesign, observer: ScheduledObserver) -> None:
     problem = ""
     if observer.dt == 0.0:
-        problem = "is continuous in time, where rows may be any time apart"
-    elif observer.correction is not None:
-        problem = "corrects its states with the parameters of the sample before"
+        problem = (
+            "is continuous in time, and what a step of implicit Euler between rows misses of the plant's own motion "
+            "has no bound that is stated"
+        )
     elif not {"tracking", WITNESSES[0]} <= set(design.certificate.matrices):
         problem = "has no certificate of decay"
     if problem:
@@ -137,26 +183,26 @@ def _bound(
     errors: ErrorsAtVertices, P: list[FloatArray], decay: float, initial_error: float | None
 ) -> UnlimitedHorizonBound:
     # In these coordinates errors shrink: the norm of one P, or that of the middle of several.
-    root = np.linalg.cholesky(np.mean(P, axis=0)).T
-    inverse = np.linalg.inv(root)
-    M, B, depth = root @ errors.M @ inverse, root @ errors.B, _depth(*errors.M.shape[:2])
-    start = None if initial_error is None else initial_error * float(np.linalg.norm(root, 2))
-    residual, sums = (errors.C @ inverse)[None], np.array([_columns(errors.D)])
-    error, driven = np.eye(len(root))[None], np.zeros(1)
-    table, shrunk, reached = [], list[float](), list[float]()
+    root = np.asarray(np.linalg.cholesky(np.mean(P, axis=0)).T)
+    inverse = np.asarray(np.linalg.inv(root))
+    own, depth = _in_coordinates(errors, root, inverse), _depth(*errors.M.shape[:2])
+    start, first = _start(errors, root, initial_error)
+    residual = _Courses(own.C, own.D, np.full(len(own.C), 0.0 if errors.first is None else _columns(errors.first.F)))
+    error = _Courses(np.eye(len(root))[None], np.zeros((1, *own.B.shape[1:])), np.zeros(1))
+    table, shrunk, reached = first, list[float](), list[float]()
     for step in range(depth + 1):
-        shrunk.append(float(np.max(_norms(error))))
-        reached.append(float(np.max(driven)))
+        shrunk.append(float(np.max(_norms(error.products))))
+        reached.append(error.largest(0.0))
         if step == depth:
             break
-        table.append(float(np.max(sums + _norms(residual) * (start or 0.0))))
-        sums, residual = _one_earlier(residual, sums, M, B)
-        driven, error = _one_earlier(error, driven, M, B)
+        table.append(residual.largest(start or 0.0))
+        residual, error = residual.one_earlier(own), error.one_earlier(own)
     # From so many samples before: at most a share of the error then, and what acts since.
     share, since = shrunk[-1], reached[-1]
     if len(P) == 1:
         share = min(share, decay**depth)
-        since = min(since, max(map(_columns, B)) * (1.0 - decay**depth) / (1.0 - decay))
+        each = max(map(_columns, own.B)) + max(map(_columns, own.K))
+        since = min(since, each * (1.0 - decay**depth) / (1.0 - decay))
     settled = since / (1.0 - share) if share < 1.0 else np.inf
     if not np.isfinite(settled):
         raise SpecError(
@@ -164,20 +210,52 @@ def _bound(
             "without faults (kind 'learned' with normal=...).",
             path="kind",
         )
-    far = _norms(residual)
     if start is None:
-        return np.zeros(0), float(np.max(sums + far * settled)) * OUTWARD
+        return np.zeros(0), residual.largest(settled) * OUTWARD
     sizes = [g * start + b for g, b in zip(shrunk[:-1], reached[:-1], strict=True)]
     while max(sizes[-depth:]) > settled * (1.0 + REMAINDER_AFTER_TABLE) and len(sizes) < MOST_TABLE:
         sizes.append(share * sizes[-depth] + since)
-    table += [float(np.max(sums + far * size)) for size in sizes[:-depth]]
-    return np.array(table) * OUTWARD, float(np.max(sums + far * max(settled, *sizes[-depth:]))) * OUTWARD
+    table += [residual.largest(size) for size in sizes[:-depth]]
+    return np.array(table) * OUTWARD, residual.largest(max(settled, *sizes[-depth:])) * OUTWARD
 
 
-def _one_earlier(courses: FloatArray, sums: FloatArray, M: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return sums and products of courses that begin a sample earlier, at every vertex."""
-    more = np.concatenate([sums + np.linalg.norm(courses @ b, axis=1).sum(axis=1) for b in B])
-    return more, np.concatenate([courses @ m for m in M])
+def _in_coordinates(errors: ErrorsAtVertices, root: FloatArray, inverse: FloatArray) -> ErrorsAtVertices:
+    return errors._replace(M=root @ errors.M @ inverse, B=root @ errors.B, C=errors.C @ inverse, K=root @ errors.K)
+
+
+def _start(errors: ErrorsAtVertices, root: FloatArray, initial_error: float | None) -> tuple[float | None, list[float]]:
+    """Return how large the error is at the start, and what the residual of the first row is where that is another."""
+    if initial_error is None:
+        return None, []
+    first = errors.first
+    if first is None:
+        return initial_error * float(np.linalg.norm(root, 2)), []
+    size = initial_error * float(np.linalg.norm(root @ first.start, 2)) + _columns(root @ first.start_inputs)
+    return size, [initial_error * float(np.linalg.norm(first.C, 2)) + _columns(first.F)]
+
+
+class _Courses(NamedTuple):
+    """What an output is made of along courses of the latest samples."""
+
+    products: FloatArray  # ``(courses, rows, n)``: from the error before them
+    pending: FloatArray  # ``(courses, rows, m)``: from the inputs of the sample of that error, but by the error itself
+    sums: FloatArray  # ``(courses,)``: norms of the columns of all later inputs
+
+    def one_earlier(self, errors: ErrorsAtVertices) -> _Courses:
+        """Return the courses that begin a sample earlier, at every vertex."""
+        corrections = errors.K if len(errors.K) == len(errors.M) else [errors.K[0]] * len(errors.M)
+        sums = [self.sums + _sums_of_columns(self.pending + self.products @ k) for k in corrections]
+        pending, products = ([self.products @ each for each in part] for part in (errors.B, errors.M))
+        return _Courses(np.concatenate(products), np.concatenate(pending), np.concatenate(sums))
+
+    def largest(self, size: float) -> float:
+        """Return the largest output after an error of a size before the courses."""
+        return float(np.max(self.sums + _sums_of_columns(self.pending) + _norms(self.products) * size))
+
+
+def _sums_of_columns(matrices: FloatArray) -> FloatArray:
+    """Return the sums of the norms of the columns of matrices ``(K, m, n)``."""
+    return np.asarray(np.linalg.norm(matrices, axis=1).sum(axis=1))
 
 
 def _norms(matrices: FloatArray) -> FloatArray:
