@@ -216,6 +216,21 @@ def test_real_poles_leave_room_for_a_damping_grid_that_can_be_read(slow) -> None
     assert not any(left.overlaps(right) for left, right in itertools.pairwise(boxes))
 
 
+def test_ticks_of_wide_eigenvalues_do_not_overlap_near_zero(slow) -> None:
+    _, observer = slow.linear
+    wide = observer.Az * 0.0 - np.diag(np.linspace(1.0, 5.0, len(observer.Az)))
+    for first, imaginary in ((0, 0.09), (2, 9.0)):
+        wide[first, first + 1], wide[first + 1, first] = imaginary, -imaginary
+        wide[first + 1, first + 1] = wide[first, first]
+    axes = plot_poles(slow.replace(observer=type(observer)(**{**observer.as_dict(), "Az": wide})))
+    axes.figure.canvas.draw()
+    low, high = axes.get_ylim()
+    ticks = [text for text in axes.get_yticklabels() if low <= text.get_position()[1] <= high]
+    boxes = [text.get_window_extent() for text in ticks if text.get_text()]
+    assert len(boxes) >= 3
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+
+
 def test_labels_of_a_damping_grid_that_would_hide_each_other_are_left_out(slow) -> None:
     _, observer = slow.linear
     flat = observer.Az * 0.0 - np.diag(np.linspace(400.0, 2000.0, len(observer.Az)))

@@ -120,7 +120,7 @@ def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentPar
             name,
             help=verb.help_text,
             add_help=words is None or name in words,
-            description=fill(verb.help_text, width=78),
+            description=fill(verb.help_text, width=78, break_on_hyphens=False),
             epilog=verb.epilog,
             formatter_class=Folded if verb.epilog else argparse.HelpFormatter,
         )
@@ -170,8 +170,9 @@ def _help_with_methods(parser: argparse.ArgumentParser) -> str:
     """Return the help of a parser with the ids of the methods."""
     from obsynth.methods.installed import REGISTRY
 
-    methods = fill(", ".join([*REGISTRY, "auto"]), width=78, initial_indent="  ", subsequent_indent="  ")
-    return f"{argparse.ArgumentParser.format_help(parser)}\nmethods:\n{methods}\n"
+    ids = ", ".join([*REGISTRY, "auto"])
+    methods = fill(ids, width=78, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+    return f"{argparse.ArgumentParser.format_help(parser)}\nmethods, each by method.id in the spec:\n{methods}\n"
 
 
 @contextmanager

@@ -77,7 +77,7 @@ VERBS = {
     ),
     "verify": Verb(
         _run_verify,
-        "Verify a saved gain set, or a certificate of any kind with all files that it refers to, again.",
+        "Verify again a saved gain set, or a certificate of any kind with all files that it refers to.",
         (
             Group(
                 "",

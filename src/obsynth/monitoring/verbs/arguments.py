@@ -38,7 +38,7 @@ MONITOR = Group("monitor", (option("--monitor", "KIND", _WHAT_A_MONITOR_DOES),))
 DISTURBANCE_COURSE = option(
     "--disturbance-course",
     "KIND",
-    "of a sampled plant, between samples: any (default), or held",
+    "between the samples of a sampled plant, disturbances do anything (any, default) or nothing (held)",
     choices=DISTURBANCES,
 )
 

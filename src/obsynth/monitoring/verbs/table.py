@@ -34,7 +34,7 @@ comma where commas separate nothing.
 Each row of estimates has a status:
   ok          nothing is missing
   warm-up     the initial-condition response has not settled yet
-  gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
+  gap         a sample is missing: fault estimates are held, the plant model replaces the sensors, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
   out         designs over a region: a scheduling parameter, an input, a measurement or the estimate is outside the \
 region, or was so until recently: nothing is claimed, no alarms
@@ -53,8 +53,8 @@ for each threshold, the guaranteed interval of each fault, and the share of each
   window      the same for the l2 norm of the residual over a window
   paper       linear, discrete: eq. (66) of Wang et al. 2015, which guarantees nothing
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
-  cusum       small changes of the residual, or of a parameter
-  nis         recursive and nonlinear designs: innovations too large for the model
+  cusum       cumulative sums: small changes of the residual, or of a parameter
+  nis         recursive and nonlinear designs: normalised innovations squared, too large for the model
   learned     every design, and the only one for those over a region: thresholds from rows without faults\
  (--normal), whatever noise the model assumes
 The scenario of --system, or the options, state which disturbances and noise to expect.
@@ -245,7 +245,7 @@ VERBS = {
                     option(
                         "--sensor-drift",
                         "N",
-                        "deviations of its noise by which each sensor may drift slowly without an alarm (0: none)",
+                        "standard deviations of its noise by which a sensor may drift without an alarm (0: none)",
                         type=float,
                     ),
                     flag("--units-as-is", "go on where a signal is likely in another unit than the plant's"),
@@ -258,7 +258,7 @@ VERBS = {
     ),
     "plot": Verb(
         _run_plot,
-        "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms.",
+        "Run a design on measured data and draw the run: outputs, estimates, residuals, thresholds and alarms.",
         (
             GAINS,
             UNVERIFIED,
@@ -347,7 +347,7 @@ VERBS = {
                     option(
                         "--write-spec",
                         "FILE",
-                        "write the spec with the constants, boxes and noise that were found",
+                        "write the spec with the constants, boxes and noise that were fitted",
                         type=Path,
                     ),
                     INPUT_DELAY,

@@ -131,6 +131,8 @@ def _discrete_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> Non
 
 
 def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> None:
+    from matplotlib.ticker import SymmetricalLogLocator
+
     axes.axvline(0.0, label="limit of stability", **_LIMIT)
     points = np.concatenate([poles, zeros])
     for values, scale, limits in (
@@ -144,10 +146,13 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
             reach = 0.5 * float(np.max(np.abs(points), initial=0.0)) or 1.0
             limits(-reach, reach)
         elif alive.max() > WIDE_RATES * alive.min():
-            scale("symlog", linthresh=float(alive.min()))
+            linear = float(alive.min())
+            scale("symlog", linthresh=linear)
             axis = axes.xaxis if scale == axes.set_xscale else axes.yaxis
-            locator: Any = axis.get_major_locator()
+            # Ticks at powers of ten outside of the linear part, in which they would overlap.
+            locator = SymmetricalLogLocator(base=10.0, linthresh=10.0 ** np.ceil(np.log10(linear)))
             locator.set_params(numticks=MOST_DECADE_TICKS)
+            axis.set_major_locator(locator)
             axis.set_minor_locator(NullLocator())
             limits(*(side * 3.0 * float(max(np.max(side * values), alive.min())) for side in (-1.0, 1.0)))
         else:
@@ -175,6 +180,7 @@ def _damping_grid(axes: Axes, *, sampled: bool) -> None:
                 continue
             labelled.append(at)
             axes.annotate(f"{ratio:g}", (place.real, place.imag), color="0.45", fontsize=7, ha="right", va="top")
+    axes.plot([], [], color="0.75", linewidth=0.9, label="damping ratio")
     axes.set_xlim(*limits[0])
     axes.set_ylim(*limits[1])
 

@@ -14,10 +14,12 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.report.plots.panels import (
+    LINE_COLOURS,
     PANEL_HEIGHT,
     WIDE_AXIS,
     WIDTH,
     finish,
+    legend_above,
     new_panels,
     one_panel,
     plain_decades,
@@ -187,15 +189,16 @@ def draw_region_trade_off(
     methods = [design.method for design in designs if not isinstance(design, str)]
     name, proved = claim
     finite = np.isfinite(numbers)
-    # Any course stands right of the fastest rate.
+    # Parameters that change at any rate are drawn to the right of the fastest rate.
     places = np.where(finite, numbers, 2.0 * float(np.max(numbers[finite], initial=0.5)))
-    panel.plot(places, proved, color="black", marker="o", markersize=4, label="proved")
+    if np.isfinite(proved).any():
+        panel.plot(places, proved, color="black", marker="o", markersize=4, label="proved")
     if np.isfinite(reached).any():
-        panel.plot(places, reached, color="0.5", marker="x", linestyle=":", label="reached by some course")
+        panel.plot(places, reached, color="0.5", marker="x", linestyle=":", label="reached by some trajectory")
     missing = np.array([isinstance(design, str) for design in designs])
     panel.set_ylim(bottom=0.0)
     if missing.any():
-        panel.plot(places[missing], np.zeros(missing.sum()), "x", color="tab:red", clip_on=False, label="none found")
+        panel.plot(places[missing], np.zeros(missing.sum()), "x", color="tab:red", clip_on=False, label="no design")
     if not finite.all():
         panel.set_xticks(places, [f"{n:g}" if ok else "any" for n, ok in zip(numbers, finite, strict=True)])
     return finish(panel, _claim_label(name, methods), below=below)
@@ -228,16 +231,19 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     along = _parameter(results, parameter)
     claim = _claim(results, claim, along)
     figure, panel = plt.subplots(figsize=(WIDTH, SWEEP_HEIGHT), layout="constrained")
+    several = len({result.name.partition(",")[0] for result in results}) > 1
     lines: dict[str, list[tuple[float, Any]]] = {}
     for number, result in enumerate(results, 1):
         place = float(number) if along is None else float(result.parameters[along])
-        lines.setdefault("" if along is None else _others(result, along), []).append((place, result))
+        label = "" if along is None else _others(result, along, several=several)
+        lines.setdefault(label, []).append((place, result))
     for number, (label, points) in enumerate(lines.items()):
         points.sort(key=lambda point: point[0])
         panel.plot(
             [place for place, _ in points],
             [result.claims.get(claim, np.nan) for _, result in points],
             linewidth=1.0,
+            color=LINE_COLOURS[number % len(LINE_COLOURS)],
             marker=MARKERS[number % len(MARKERS)],
             markersize=4,
             label=label if label and number < MOST_LINES else None,
@@ -267,7 +273,7 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     panel.set_ylabel(_claim_label(claim, [result.facts.get("method", "") for result in results]))
     tidy(panel)
     if panel.get_legend_handles_labels()[1]:
-        panel.legend(frameon=False, fontsize="small")
+        legend_above(panel)
     return figure
 
 
@@ -296,10 +302,11 @@ def _parameter(results: Sequence[Any], parameter: str | None) -> str | None:
     return parameter or max(sorted(varied), key=lambda name: varied[name], default=None)
 
 
-def _others(result: Any, along: str) -> str:
-    stem = result.name.partition(",")[0]
-    said = [f"{name.rpartition('.')[2]} = {value}" for name, value in result.parameters.items() if name != along]
-    return ", ".join([stem, *said])
+def _others(result: Any, along: str, *, several: bool) -> str:
+    """Return the values of the other parameters of a case, after the name of its plant where there are several."""
+    plant = [result.name.partition(",")[0]] if several else []
+    values = [f"{name.rpartition('.')[2]} = {value}" for name, value in result.parameters.items() if name != along]
+    return ", ".join([*plant, *values])
 
 
 def _spread(values: list[float]) -> bool:

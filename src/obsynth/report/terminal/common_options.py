@@ -24,7 +24,7 @@ count = number_type("count", int, lambda value: value >= 1, "is less than 1")
 INPUT_DELAY = option(
     "--input-delay",
     "ROWS",
-    "by how many rows of the log inputs act later than in the design (default: from inputs.hold in the spec; "
+    "rows of the log by which inputs act later than in the design (default: from inputs.hold in the spec; "
     "calibrate also takes 'auto')",
     type=delay,
 )

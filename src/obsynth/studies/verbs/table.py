@@ -102,7 +102,7 @@ VERBS = {
                     option(
                         "--tolerance",
                         "T",
-                        "relative error of the parameters that are drawn (default: 0)",
+                        "relative error of the drawn parameters (default: 0)",
                         type=float,
                         default=0.0,
                     ),
