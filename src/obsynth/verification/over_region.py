@@ -1,4 +1,4 @@
-"""Rows on scheduled designs: what is claimed for every point of a region, and for every course of the parameters.
+"""Rows on scheduled designs: what is claimed for every point of a region, and for every trajectory of the parameters.
 
 The plant and the observer are both means of vertices with the same weights, so that what is linear in both is checked
 at the vertices; what is proved there in balls is true for every course of the weights (`obsynth.proofs.
@@ -31,7 +31,8 @@ from obsynth.proofs.vertex_inequalities import (
     prove_gain,
     prove_mean_square,
 )
-from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
+from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import equality, tracking_identities, worst
 
@@ -59,6 +60,37 @@ def courses(scheduling: Scheduling, steps: float | None) -> str:
     if steps is None:
         return f"for every course of {', '.join(scheduling.names)}, jumps among them"
     return f"for every course of {scheduling.names[0]} that changes by at most {scheduling.rates[0]:.6g} in a second"
+
+
+def scheduled_pair(design: ObserverDesign) -> tuple[PolytopicSystem, ScheduledObserver] | None:
+    """Return the plant and the observer of a design over a region; ``None`` where they are of other kinds."""
+    plant, observer = design.plant, design.observer
+    if isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver):
+        return plant, observer
+    return None
+
+
+def wrong_kinds_row() -> Check:
+    """Return the failing row of a design that `scheduled_pair` has none of."""
+    return fitting_check("a scheduled observer for a polytopic plant", fits=False)
+
+
+def share_signals(plant: PolytopicSystem, observer: ScheduledObserver) -> bool:
+    """Return whether an observer has the vertices, the sample time, and the inputs, outputs and states of a plant."""
+    return (
+        observer.count == plant.count
+        and observer.dt == plant.dt
+        and observer.input_names[: observer.inputs] == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == plant.state_names
+    )
+
+
+def vertex_errors(
+    plant: PolytopicSystem, observers: Iterable[LinearObserver], tracking: FloatArray
+) -> list[ErrorModel]:
+    """Return the error system at each vertex, of the observers there."""
+    return [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, observers, strict=True)]
 
 
 def same_scheduling_row(plant: PolytopicSystem, observer: ScheduledObserver) -> Check:

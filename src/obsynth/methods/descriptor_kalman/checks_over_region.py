@@ -19,7 +19,6 @@ from obsynth.proofs.vertex_inequalities import Vertex, pairs_of
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
-from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Residual, equality
 from obsynth.verification.over_region import (
     FROZEN_ROW,
@@ -30,8 +29,12 @@ from obsynth.verification.over_region import (
     deviation_row,
     forgetting_row,
     same_scheduling_row,
+    scheduled_pair,
+    share_signals,
     tracking_rows,
+    vertex_errors,
     witness_of_certificate,
+    wrong_kinds_row,
 )
 from obsynth.verification.plant import condition_rows
 
@@ -50,11 +53,11 @@ _IDENTITIES = {
 
 def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     """Yield every check of a Kalman filter over a region; see `obsynth.verify`."""
-    plant, observer = design.plant, design.observer
-    fits = isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)
-    if not (isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)):
-        yield fitting_check("a scheduled observer for a polytopic plant", fits=fits)
+    pair = scheduled_pair(design)
+    if pair is None:
+        yield wrong_kinds_row()
         return
+    plant, observer = pair
     tracking, noise = design.certificate.matrices.get("tracking"), _noise(design, plant)
     fits = tracking is not None and noise is not None and _fits(plant, observer, tracking)
     yield fitting_check("observer, certificate, noise and plant have matching signals and shapes", fits=fits)
@@ -66,8 +69,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     if not same.passed:
         return
     observers = [observer.at_vertex(place) for place in range(plant.count)]
-    models = [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, observers, strict=True)]
-    yield from tracking_rows(models, plant.scheduling, _IDENTITIES)
+    yield from tracking_rows(vertex_errors(plant, observers, tracking), plant.scheduling, _IDENTITIES)
     yield _unknown_input_row(plant, tracking)
     yield from _proved_rows(design, plant, observer, tracking, noise)
 
@@ -82,12 +84,8 @@ def _noise(design: ObserverDesign, plant: PolytopicSystem) -> NoiseOverRegion | 
 
 def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
     return bool(
-        observer.count == plant.count
-        and observer.dt == plant.dt
+        share_signals(plant, observer)
         and observer.order == plant.nx
-        and observer.input_names[: observer.inputs] == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
         and observer.residual_names == plant.output_names
         and not observer.fault_names
         and not any(observer.state_delays)

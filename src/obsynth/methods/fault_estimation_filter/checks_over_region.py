@@ -34,20 +34,23 @@ from obsynth.verification.over_region import (
     fault_error_vertices,
     forgetting_row,
     same_scheduling_row,
+    scheduled_pair,
     tracking_rows,
+    vertex_errors,
     witness_of_certificate,
     worst_of_vertices,
+    wrong_kinds_row,
 )
 from obsynth.verification.plant import condition_rows
 
 
 def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     """Yield every check of a filter over a region; see `obsynth.verify`."""
-    plant, observer = design.plant, design.observer
-    fitting = isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)
-    if not (isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)):
-        yield fitting_check("a scheduled observer for a polytopic plant", fits=fitting)
+    pair = scheduled_pair(design)
+    if pair is None:
+        yield wrong_kinds_row()
         return
+    plant, observer = pair
     yield from condition_rows(conditions_over_region(plant))
     if observer.correction is not None:
         yield from turning_checks(design, plant, observer)
@@ -66,7 +69,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     if not same.passed:
         return
     observers = [observer.at_vertex(place) for place in range(plant.count)]
-    models = [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, observers, strict=True)]
+    models = vertex_errors(plant, observers, tracking)
     yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, observers, tracking, models)
     yield from _proved_rows(design, plant, observer, tracking)

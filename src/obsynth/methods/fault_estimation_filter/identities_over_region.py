@@ -14,7 +14,7 @@ from obsynth.proofs.vertex_inequalities import Vertex, Witness
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
-from obsynth.verification.over_region import gain_row, switching_row
+from obsynth.verification.over_region import gain_row, share_signals, switching_row
 
 #: Names, claims and sources of the rows on what makes a filter unbiased.
 IDENTITIES = {
@@ -34,11 +34,7 @@ _ROOM = 4.0 * float(np.finfo(np.float64).eps)
 def have_matching_signals(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
     """Whether an observer and a tracking map are for the signals of a plant, by names and shapes."""
     return (
-        observer.count == plant.count
-        and observer.dt == plant.dt
-        and observer.input_names[: observer.inputs] == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
+        share_signals(plant, observer)
         and observer.fault_names == plant.fault_names
         and observer.state_delays == (0,) * plant.nx
         and observer.fault_delays == (1,) * plant.nf

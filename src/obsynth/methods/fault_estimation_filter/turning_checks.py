@@ -27,7 +27,6 @@ from obsynth.proofs.vertex_inequalities import Vertex
 from obsynth.results.checks import Check, fitting_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
-from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Identity, equality, worst
 from obsynth.verification.over_region import (
     DECOUPLING_ROW,
@@ -36,6 +35,7 @@ from obsynth.verification.over_region import (
     forgetting_row,
     same_scheduling_row,
     tracking_rows,
+    vertex_errors,
     witness_of_certificate,
 )
 
@@ -54,7 +54,7 @@ def turning_checks(design: ObserverDesign, plant: PolytopicSystem, observer: Sch
     if not same.passed:
         return
     undivided = [observer.before_division(place) for place in range(plant.count)]
-    models = [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, undivided, strict=True)]
+    models = vertex_errors(plant, undivided, tracking)
     yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, tracking, K)
     yield from _proved_rows(design, plant, observer, tracking, K)

@@ -30,8 +30,11 @@ from obsynth.verification.over_region import (
     rated_gain_row,
     region_gain_row,
     same_scheduling_row,
+    scheduled_pair,
+    share_signals,
     switching_row,
     witness_of_certificate,
+    wrong_kinds_row,
 )
 from obsynth.verification.plant import condition_rows
 
@@ -40,11 +43,11 @@ _MATRICES = ("tracking", "Phi", "Cw")
 
 def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     """Yield every check of an observer over a region; see `obsynth.verify`."""
-    plant, observer = design.plant, design.observer
-    fits = isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)
-    if not (isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)):
-        yield fitting_check("a scheduled observer for a polytopic plant", fits=fits)
+    pair = scheduled_pair(design)
+    if pair is None:
+        yield wrong_kinds_row()
         return
+    plant, observer = pair
     matrices = design.certificate.matrices
     fits = _fits(plant, observer, matrices)
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
@@ -72,12 +75,8 @@ def _fits(plant: PolytopicSystem, observer: ScheduledObserver, matrices: Mapping
         and cw.shape == (plant.nf, order)
         and all(np.isfinite(matrix).all() for matrix in (tracking, phi, cw))
         and observer.order == plant.nx + order
-        and observer.count == plant.count
-        and observer.dt == plant.dt
+        and share_signals(plant, observer)
         and observer.effectiveness_is_one
-        and observer.input_names[: observer.inputs] == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
         and observer.fault_names == plant.fault_names
         and not any((*observer.state_delays, *observer.fault_delays))
     )

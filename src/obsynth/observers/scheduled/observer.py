@@ -40,6 +40,7 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_delays, require_names, whole_record
 from obsynth.observers.running import Observer
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.scheduling import RATE_TOLERANCE, Scheduling
 
 #: The matrices that have a value at each vertex; of the others there is one.
@@ -128,6 +129,23 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     state_delays: tuple[int, ...]
     fault_delays: tuple[int, ...]
     correction: FloatArray | None = None
+
+    @staticmethod
+    def names_of(plant: PolytopicSystem) -> dict[str, Any]:
+        """Return the fields that an observer of all states has from its plant: sample time, scheduling and names.
+
+        Parameters
+        ----------
+        plant : PolytopicSystem
+            Its scheduling parameters are read after its known inputs.
+        """
+        return {
+            "scheduling": plant.scheduling,
+            "dt": plant.dt,
+            "input_names": (*plant.input_names, *plant.scheduling.read_names),
+            "output_names": plant.output_names,
+            "state_names": plant.state_names,
+        }
 
     def __post_init__(self) -> None:
         require_kind(self.scheduling, Scheduling, "scheduling", "a Scheduling")
