@@ -69,4 +69,4 @@ def test_help_is_folded_to_the_terminal(
     if verb == "run":
         # What follows the first line of an item hangs below its text.
         place = lines.index("  gap         a sample is missing: fault estimates are held, the plant")
-        assert lines[place + 1] == "              model stands in, no alarms"
+        assert lines[place + 1] == "              model replaces the sensors, no alarms"

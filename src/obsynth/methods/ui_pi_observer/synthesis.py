@@ -126,16 +126,7 @@ def synthesise(
         else placement_problem(designed, model, known.fixed_modes, joint=method.joint, paper_matrices=paper_matrices)
     )
     if method.G is not None:
-        # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
-        modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
-        unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
-        if unstable:
-            raise PreconditionError(
-                f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
-                "rank, and equations of the plant are lost with it. Leave E_sharp, C_sharp and G out.",
-                condition="fixed modes",
-                mode=unstable[0],
-            )
+        _require_stable_fixed_modes(problem)
     progress("choosing the gains")
     gain, placed_poles, claims, runs = tried[1] if tried else _chosen(method, problem, region, weights, plant.dt)
     if merged is not None and working.Bw.any() and "noise_price" in claims:
@@ -158,6 +149,20 @@ def synthesise(
         tuple(notes(known, problem, method, synthesis.certificate.claims)),
         known.transformation,
     )
+
+
+def _require_stable_fixed_modes(problem: PlacementProblem) -> None:
+    """Raise `PreconditionError` where the matrices of the options fix a mode that is not stable."""
+    # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
+    modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
+    unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
+    if unstable:
+        raise PreconditionError(
+            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
+            "rank, and equations of the plant are lost with it. Leave E_sharp, C_sharp and G out.",
+            condition="fixed modes",
+            mode=unstable[0],
+        )
 
 
 def _without_likeness(
