@@ -22,11 +22,11 @@ from obsynth.errors import PreconditionError, SolverError
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.decoupling_windows import EstimationProblem, Model
 from obsynth.numerics.gramians import gramian
-from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati, discrete_riccati
+from obsynth.numerics.matrix_equations import discrete_riccati
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
-from obsynth.numerics.standard_form import reachable_basis, uncayley
+from obsynth.numerics.standard_form import reachable_basis
 
 #: Least singular value of [A - z I; C] at a mode z, beside the norm of both, above which the outputs show that mode.
 SHOWN_SHARE = 1e-6
@@ -59,8 +59,6 @@ NEGATIVE_SHARE = 1e-7
 WORST_LEVELS = (1.0 + 1e-6, 1.0 + 1e-5, 1.0001, 1.001, 1.01)
 #: What a bound is lowered by, of itself, for the rounding of its sums.
 BOUND_ROUNDING = 1e-9
-#: White noise that passes to the error by less than this share is rounding.
-WHITE_SHARE = 1e-9
 #: A gain below this share of the problem's own sizes is zero but for rounding.
 ZERO_SHARE = 1e-9
 #: Samples, and inputs in all, of the finite records that are searched for what r does not show.
@@ -151,67 +149,6 @@ def achieved(white: Whitened, K: FloatArray, Z0: FloatArray, norm: str) -> float
 def require_stable_filter(problem: EstimationProblem) -> None:
     """Raise `PreconditionError` where no filter is stable: cheaper than the least one."""
     whitened(problem)
-
-
-class ContinuousFilter(NamedTuple):
-    """``chi' = A chi + G Y``, ``ehat = C chi + D Y`` in continuous time, and the root mean square of its error."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    deviation: float
-
-
-def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
-    """Return the continuous-time filter of least mean square: the Cayley transform of the problem keeps no H2 norm.
-
-    Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
-    """
-    rows = len(problem.C)
-    a, b, outputs, direct = uncayley(
-        problem.A,
-        problem.B,
-        np.vstack([problem.C, problem.L]),
-        np.vstack([problem.D, problem.D1]),
-        problem.alpha,
-    )
-    c, error_rows, d, d1 = outputs[:rows], outputs[rows:], direct[:rows], direct[rows:]
-    Z0 = d1 @ np.linalg.pinv(d)
-    if np.linalg.norm(d1 - Z0 @ d) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)):
-        raise PreconditionError(
-            "White noise passes to the error whatever the filter: its mean square is infinite. Give a reference model "
-            "of higher order, or norm hinf.",
-            condition="finite mean square",
-        )
-    if not rows:
-        # Nothing is left to be weighed: there is one filter.
-        if np.any(np.linalg.eigvals(a).real >= -0.5 * (1.0 - STABLE_RADIUS) * problem.alpha):
-            raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
-        covariance = np.zeros_like(a)
-    else:
-        covariance = _continuous_covariance(a, b, c, d)
-    K = np.asarray(np.linalg.solve(d @ d.T, c @ covariance + d @ b.T).T)
-    closed, closed_b, closed_l = a - K @ c, b - K @ d, error_rows - Z0 @ c
-    spread = continuous_lyapunov(closed, -closed_b @ closed_b.T) if len(a) else np.zeros((0, 0))
-    deviation = float(np.sqrt(max(np.trace(closed_l @ spread @ closed_l.T), 0.0)))
-    half = np.linalg.solve(np.eye(len(problem.A)) + problem.A, problem.G)
-    moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
-    residual_input, direct_estimate = problem.V + through[:rows], problem.F + through[rows:]
-    return ContinuousFilter(
-        closed, moved + K @ residual_input, -closed_l, direct_estimate - Z0 @ residual_input, deviation
-    )
-
-
-def _continuous_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    try:
-        return continuous_riccati(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise PreconditionError(
-            "Some output is measured without noise, or the faults have a zero that is not strictly stable: the filter "
-            f"of least mean square has no Riccati equation ({error}). State the noise of every sensor (sensor_noise).",
-            condition="zeros",
-        ) from None
 
 
 def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:

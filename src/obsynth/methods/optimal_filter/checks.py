@@ -357,7 +357,7 @@ def _least_deviation(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     """Compute the least mean square from the plant again: the filtering Riccati equation is the proof."""
     stated, fault_map = claimed(design.certificate.claims, "least_deviation"), _claimed_map(design)
     of = "every causal linear filter with this fault map"
-    least = _least_or_nan(lambda: designed(plant, fault_map, "h2").gain)
+    least = _least_or_nan(lambda: designed(plant, fault_map, "h2").least_gain)
     if not least * (1.0 + DEVIATION_SHARE) >= stated:
         every = _least_or_nan(lambda: least_deviation_of_every_start(plant, fault_map, design.options.get("weights")))
         if every > least or np.isnan(least):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +22,8 @@ from obsynth.verification.error_system import ErrorModel
 ROUNDED_UNITS = 1e4
 #: Of what noise could do at most, what stored numbers may leave where everything cancels.
 ROUNDED_SHARE = 1e-6
+#: A mean square that one step of refinement moves by more than this share of itself has lost its digits.
+LOST_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,13 +62,18 @@ class ErrorChannel:
 
     @property
     def size(self) -> float:
-        """What the noise could do to the error in a sample, whatever cancels."""
+        """What noise, and faults that pass by no exact map, could do to the error in a sample, whatever cancels."""
         model = self.model
         observer, plant = model.observer, model.plant
-        own = model.driven_at_most(plant.Bw) + np.abs(observer.By) @ np.abs(plant.Dw)
-        direct = np.abs(observer.Dy) @ np.abs(plant.Dw)
+        driving, showing = (
+            (plant.Bw, plant.Dw)
+            if self.matched is None
+            else (np.hstack([plant.Bf, plant.Bw]), np.hstack([plant.Df, plant.Dw]))
+        )
+        own = model.driven_at_most(driving) + np.abs(observer.By) @ np.abs(showing)
+        direct = np.abs(observer.Dy) @ np.abs(showing)
         if model.T0 is not None:
-            direct = direct + np.abs(model.T0[:, : plant.nx]) @ np.abs(plant.Bw)
+            direct = direct + np.abs(model.T0[:, : plant.nx]) @ np.abs(driving)
         return float(np.linalg.norm(observer.Cz) * np.linalg.norm(own) + np.linalg.norm(direct))
 
     @property
@@ -80,15 +88,22 @@ class ErrorChannel:
         return ROUNDED_SHARE * self.size
 
     def deviation(self, dt: float) -> float:
-        """Return the root mean square of the error for white noise of unit intensity; infinite where this passes."""
+        """Return the root mean square of the error for white noise of unit intensity; infinite where this passes.
+
+        It is no number where rounding of the Lyapunov equation leaves no digits of it.
+        """
         (a, b, c, d), direct = self.middle, self(Ball)[3]
-        if dt > 0.0:
-            covariance = discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
-        else:
-            covariance = continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
+        if dt == 0.0:
             # White noise that passes, by more than rounding, has no mean square.
             d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
-        return float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
+        square, lost = 0.0, 0.0
+        if len(a):
+            covariance, corrected = _covariances(a, b, dt)
+            square = float(np.trace(c @ corrected @ c.T))
+            lost = abs(square - float(np.trace(c @ covariance @ c.T)))
+        if not lost <= max(LOST_SHARE * square, (self.rounding / self.unit) ** 2):
+            return math.nan
+        return float(np.sqrt(max(square, 0.0) + np.sum(d**2)))
 
     def __call__(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         """Return the matrices with what forming them may have cost."""
@@ -130,6 +145,19 @@ class ErrorChannel:
             kind.blocks([[c, -cr]]),
             kind.blocks([[direct_fault - dr, through]]),
         )
+
+
+def _covariances(a: FloatArray, b: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance of states that unit white noise drives, and the same refined once by its residual."""
+    driven = b @ b.T
+    with warnings.catch_warnings(action="ignore"):
+        if dt > 0.0:
+            covariance = discrete_lyapunov(a, driven)
+            step = discrete_lyapunov(a, a @ covariance @ a.T - covariance + driven)
+        else:
+            covariance = continuous_lyapunov(a, -driven)
+            step = continuous_lyapunov(a, -(a @ covariance + covariance @ a.T + driven))
+    return covariance, covariance + step
 
 
 def _identity(count: int) -> Model:

@@ -21,10 +21,10 @@ from obsynth.numerics.least_estimation import (
     ADDED_NOISES,
     LeastEstimation,
     least_estimation,
-    least_mean_square,
     realised,
     require_stable_filter,
 )
+from obsynth.numerics.least_mean_square import least_mean_square
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import cayley, cayley_point, finite_poles, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
@@ -126,6 +126,11 @@ class Designed(NamedTuple):
     decays: tuple[ComplexArray, ...]
     nothing: float
     least: float | None = None  # where the filter is another one than that of least norm
+
+    @property
+    def least_gain(self) -> float:
+        """The least norm of all filters with this fault map."""
+        return self.gain if self.least is None else self.least
 
     @property
     def is_nothing(self) -> bool:
@@ -326,20 +331,19 @@ def designed(
         size = min(size, _reference_gain(plant, fault_map, problem.alpha) / ratio)
     try:
         if norm == "h2" and not plant.is_discrete:
-            continuous = least_mean_square(problem)
-            estimation = None
-            filter_ = continuous.A, continuous.B, continuous.C, continuous.D
-            gain = continuous.deviation
+            continuous = least_mean_square(problem, noises=noises)
+            filter_, gain = continuous.filter, continuous.deviation
+            nothing = filter_[0]
+            least = LeastEstimation(nothing, nothing, gain, 0.0, 0.0, continuous.added_noise, ())
+            least_gain = continuous.least * ratio if continuous.added_noise else None
         else:
-            estimation = least_estimation(problem, norm=norm, noises=noises)
-            filter_, gain = realised(problem, estimation.K, estimation.Z0, plant.ny), estimation.gain
+            least, least_gain = least_estimation(problem, norm=norm, noises=noises), None
+            filter_, gain = realised(problem, least.K, least.Z0, plant.ny), least.gain
             filter_ = filter_ if plant.is_discrete else uncayley(*filter_, problem.alpha)
     except np.linalg.LinAlgError as error:
         raise PreconditionError(
             f"The equations of the least gain have no solution: {error}.", condition="zeros"
         ) from error
-    nothing = filter_[0]
-    least = estimation or LeastEstimation(nothing, nothing, gain, 0.0, 0.0, 0.0, ())
     return Designed(
         fault_map,
         problem,
@@ -350,6 +354,7 @@ def designed(
         least.added_noise,
         least.decays,
         ZERO_GAIN * (1.0 + size) * ratio,
+        least_gain,
     )
 
 
@@ -373,4 +378,4 @@ def least_deviation_of_every_start(plant: DescriptorSystem, fault_map: FaultMap,
     """
     reached, undriven = with_growing_modes_reached(plant)
     own = on_plant(reached, fault_map, weights)._replace(undriven=undriven)
-    return designed(reached, own, "h2").gain
+    return designed(reached, own, "h2").least_gain

@@ -1,0 +1,234 @@
+"""The least mean square over all causal linear filters in continuous time, with a filter that reaches it.
+
+``x' = a x + b w + m Y`` is seen by ``rho Y = c x + d w``, w white; wanted is ``l x + d1 w``.  Outputs without noise of
+their own show states exactly, and their derivatives the others with the noise of the states (Bryson and Johansen 1965):
+without the exact states the same problem has less states.  One such step leaves a filter that needs no derivative.
+What takes more of them is approached, by filters for a little noise on the outputs, as near as one likes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.decoupling_windows import EstimationProblem, Model
+from obsynth.numerics.least_estimation import STABLE_RADIUS, UNSTABLE_ZERO
+from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati
+from obsynth.numerics.ranks import ROUNDED_ZERO, WINDOW_RANK_TOLERANCE
+from obsynth.numerics.standard_form import uncayley
+
+#: White noise that passes to the error by less than this share is rounding.
+WHITE_SHARE = 1e-9
+#: Noise added to the outputs, of what the states' noise does to them, largest first.
+ADDED_NOISES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+#: Less noise is added until the mean square, its root, is so near the least one.
+NEAR_THE_LEAST = 1.01
+#: Where the least one is zero, as small beside that of no filter at all.
+NEARLY_ZERO = 1e-3
+#: Below this share of that of the filter the least one is rounding: the root of that of a covariance.
+ROUNDING_SHARE = 1e-5
+
+
+class ContinuousFilter(NamedTuple):
+    """``chi' = A chi + B Y``, ``ehat = C chi + D Y``, and the root mean square of its error, beside the least one."""
+
+    filter: Model
+    deviation: float
+    least: float
+    added_noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """``x' = a x + b w`` is seen by ``c x + d w``.
+
+    ``units`` are the sizes of what the rows of d are differences of, ``reach`` is that of what w drives the states to.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    d: FloatArray
+    units: FloatArray
+    reach: float
+
+    def covariance(self) -> FloatArray:
+        """Return the least covariance of the error of x; raise `PreconditionError` where there is none."""
+        a, b, c, d = self.a, self.b, self.c, self.d
+        if not len(a):
+            return np.zeros_like(a)
+        if not len(c):
+            # Nothing is left to be weighed: there is one filter.
+            if np.any(np.linalg.eigvals(a).real >= -0.5 * (1.0 - STABLE_RADIUS) * np.linalg.norm(a)):
+                raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
+            return continuous_lyapunov(a, -b @ b.T)
+        try:
+            return continuous_riccati(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise PreconditionError(
+                "The faults have a zero that is not strictly stable, or what the noise does to the outputs has one on "
+                f"the imaginary axis: the filter of least mean square has no Riccati equation ({error}). State the "
+                "noise of every sensor (sensor_noise).",
+                condition="zeros",
+            ) from None
+
+    def gain(self) -> FloatArray:
+        """Return the gain of the filter of least covariance."""
+        if not len(self.c):
+            return np.zeros((len(self.a), 0))
+        covariance = self.covariance()
+        return np.asarray(
+            np.linalg.solve(self.d @ self.d.T, self.c @ covariance + self.d @ self.b.T).T, dtype=np.float64
+        )
+
+    def deviation(self, gain: FloatArray, wanted: FloatArray) -> float:
+        """Return the root mean square of ``wanted`` times the error of a filter with this gain."""
+        closed, driven = self.a - gain @ self.c, self.b - gain @ self.d
+        spread = continuous_lyapunov(closed, -driven @ driven.T) if len(closed) else np.zeros_like(closed)
+        return float(np.sqrt(max(np.trace(wanted @ spread @ wanted.T), 0.0)))
+
+    def with_noise(self, share: float) -> _Measured:
+        """Return the same with noise of its own on every output: a share of what the states' noise does to it."""
+        rows, rate = len(self.c), max(float(np.linalg.norm(self.a)), SMALLEST)
+        size = share * (float(np.linalg.norm(self.c) * np.linalg.norm(self.b)) / rate + float(np.linalg.norm(self.d)))
+        b = np.hstack([self.b, np.zeros((len(self.b), rows))])
+        return _Measured(self.a, b, self.c, np.hstack([self.d, size * np.eye(rows)]), self.units, self.reach)
+
+
+class _Split(NamedTuple):
+    """The states that outputs do not show exactly, ``N' x``, as a problem of their own, and the way back.
+
+    ``shown @ c`` times x is shown exactly, ``noisy @ c x + ...`` with noise; ``x = N x1 + known (shown @ c x)``.
+    """
+
+    rest: _Measured
+    N: FloatArray
+    noisy: FloatArray
+    shown: FloatArray
+    known: FloatArray
+
+
+def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (0.0,)) -> ContinuousFilter:
+    """Return the continuous-time filter of least mean square: the Cayley transform of the problem keeps no H2 norm.
+
+    The first of ``noises`` is added to every output; where it is zero, as much as the problem needs.
+
+    Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
+    """
+    rows = len(problem.C)
+    a, b, outputs, direct = uncayley(
+        problem.A,
+        problem.B,
+        np.vstack([problem.C, problem.L]),
+        np.vstack([problem.D, problem.D1]),
+        problem.alpha,
+    )
+    half = np.linalg.solve(np.eye(len(problem.A)) + problem.A, problem.G)
+    moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
+    residual, estimate = problem.V + through[:rows], problem.F + through[rows:]
+    c, wanted, d1 = outputs[:rows], outputs[rows:], direct[rows:]
+    reach = float(np.linalg.norm(np.linalg.inv(np.eye(len(a)) + problem.A)) * np.linalg.norm(problem.B))
+    units = np.linalg.norm(problem.D, axis=1) + np.linalg.norm(problem.C, axis=1) * reach
+    # Outputs that follow from others show nothing but rounding.
+    shows = units > WINDOW_RANK_TOLERANCE * np.linalg.norm(residual, axis=1)
+    c, direct, residual, units = c[shows], direct[:rows][shows], residual[shows], units[shows]
+    measured = _Measured(a, b, c, direct, units, reach)
+    split, added = _split(measured), noises[0]
+    noisy = measured.d if split is None else split.noisy @ measured.d
+    Z0 = d1 @ np.linalg.pinv(noisy)
+    if np.linalg.norm(d1 - Z0 @ noisy) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)):
+        raise PreconditionError(
+            "White noise passes to the error whatever the filter: its mean square is infinite. Give a reference model "
+            "of higher order, or norm hinf.",
+            condition="finite mean square",
+        )
+    if split is None:
+        K, error_rows = (measured.with_noise(added) if added else measured).gain(), wanted - Z0 @ c
+        filter_ = a - K @ c, moved + K @ residual, -error_rows, estimate - Z0 @ residual
+        deviation = measured.deviation(K, error_rows)
+        least = _least(measured, error_rows) if added else deviation
+        return ContinuousFilter(filter_, deviation, least, added)
+    return _of_the_rest(split, measured, (moved, residual, estimate), (Z0 @ split.noisy, wanted), added)
+
+
+def _of_the_rest(
+    split: _Split,
+    measured: _Measured,
+    inputs: tuple[FloatArray, FloatArray, FloatArray],
+    wanted: tuple[FloatArray, FloatArray],
+    added: float,
+) -> ContinuousFilter:
+    """Return the filter of the states that no output shows exactly: its own states are ``N' x - K2 shown``."""
+    (moved, residual, estimate), N, a, c = inputs, split.N, measured.a, measured.c
+    Z0, rows = wanted
+    error_rows = rows - Z0 @ c
+    least = _least(split.rest, error_rows @ N)
+    if added:
+        K, noise = split.rest.with_noise(added).gain(), added
+    else:
+        K, noise = _gain_near_the_least(split.rest, error_rows @ N, least)
+    K1, K2 = K[:, : len(split.noisy)], K[:, len(split.noisy) :]
+    driven = N.T @ a - K1 @ split.noisy @ c - K2 @ split.shown @ c @ a
+    exact = (N @ K2 + split.known) @ split.shown @ residual
+    filter_ = (
+        driven @ N,
+        driven @ exact + K1 @ split.noisy @ residual + (N.T - K2 @ split.shown @ c) @ moved,
+        -error_rows @ N,
+        estimate - Z0 @ residual - error_rows @ exact,
+    )
+    deviation = split.rest.deviation(K, error_rows @ N)
+    return ContinuousFilter(filter_, deviation, least if least > ROUNDING_SHARE * deviation else 0.0, noise)
+
+
+def _gain_near_the_least(rest: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
+    """Return the gain of least mean square, or one for added noise that comes near to it, and that noise."""
+    if not len(rest.c) or _split(rest) is None:
+        return rest.gain(), 0.0
+    enough, best = NEAR_THE_LEAST * least, None
+    for share in ADDED_NOISES:
+        try:
+            gain = rest.with_noise(share).gain()
+        except PreconditionError:
+            continue
+        deviation = rest.deviation(gain, wanted)
+        if best is None:
+            enough = max(enough, NEARLY_ZERO * deviation)
+        if best is None or deviation < best[0]:
+            best = deviation, gain, share
+        if deviation <= enough:
+            break
+    if best is None:
+        raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
+    return best[1], best[2]
+
+
+def _least(measured: _Measured, wanted: FloatArray) -> float:
+    """Return the least mean square, its root, of any filter: without states that outputs and derivatives show."""
+    while (split := _split(measured)) is not None:
+        measured, wanted = split.rest, wanted @ split.N
+    return float(np.sqrt(max(np.trace(wanted @ measured.covariance() @ wanted.T), 0.0)))
+
+
+def _split(measured: _Measured) -> _Split | None:
+    """Return the states that outputs do not show exactly; ``None`` where every output has noise of its own."""
+    a, b, c, d = measured.a, measured.b, measured.c, measured.d
+    if not len(c):
+        return None
+    left, sizes, _ = np.linalg.svd(d / measured.units[:, None])
+    rank = int(np.sum(sizes > ROUNDED_ZERO))
+    if rank == len(c):
+        return None
+    noisy, quiet = left[:, :rank].T / measured.units, left[:, rank:].T / measured.units
+    turned, shown_sizes, directions = np.linalg.svd(quiet @ c)
+    count = int(np.sum(shown_sizes * measured.reach > WINDOW_RANK_TOLERANCE))
+    shown, N = turned[:, :count].T @ quiet, directions[count:].T
+    known = directions[:count].T / shown_sizes[:count]
+    rows, through = np.vstack([noisy @ c, shown @ c @ a]), np.vstack([noisy @ d, shown @ c @ b])
+    moved = np.linalg.norm(shown @ c, axis=1) * np.linalg.norm(b)
+    units = np.concatenate([np.ones(rank), np.where(moved > 0.0, moved, 1.0)])
+    return _Split(_Measured(N.T @ a @ N, N.T @ b, rows @ N, through, units, measured.reach), N, noisy, shown, known)
