@@ -105,6 +105,18 @@ def test_a_least_mean_square_that_is_not_reached_is_approached(seed: int) -> Non
     assert design.solver["added_noise"] > 0.0
 
 
+@pytest.mark.parametrize("seed", [4, 39, 53])
+def test_an_exact_fault_map_has_the_least_mean_square_of_sensors_without_noise(seed: int) -> None:
+    design = obsynth.optimal_filter(plant_of(seed), reference=REFERENCE, norm="h2")
+    claims, noisy = design.certificate.claims, plant_of(seed)
+    noisy = noisy.replace(
+        Bw=np.hstack([noisy.Bw, np.zeros((noisy.nx, noisy.ny))]), Dw=np.hstack([noisy.Dw, 1e-4 * np.eye(noisy.ny)])
+    )
+    regular = obsynth.optimal_filter(noisy, reference=REFERENCE, norm="h2").certificate.claims["least_deviation"]
+    assert claims["deviation"] == claims["least_deviation"]
+    assert 0.98 * regular < claims["least_deviation"] < regular * (1.0 + 1e-6)
+
+
 @pytest.mark.parametrize("seed", [15, 43, 55, 59])
 def test_sensors_without_noise_that_follow_from_others_change_nothing(seed: int) -> None:
     design = obsynth.optimal_filter(plant_of(seed), reference=REFERENCE, norm="h2")
