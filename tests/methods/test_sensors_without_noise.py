@@ -121,6 +121,20 @@ def test_sensors_without_noise_that_follow_from_others_change_nothing(seed: int)
     assert np.max(np.abs(design.observer.By), initial=0.0) < 1e3
 
 
+def test_outputs_that_show_derivatives_of_white_noise_have_no_filter_of_least_mean_square() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 0.0]),
+        A=[[-1.5, 2.0], [-1.0, 0.0]],
+        Bf=[[1.0], [0.5]],
+        Bw=[[0.5], [1.0]],
+        C=[[0.5, -1.0]],
+        dt=0.0,
+    )
+    with pytest.raises(obsynth.PreconditionError, match=r"derivatives of noise or of faults.*Give norm hinf"):
+        matched(plant)
+    assert obsynth.optimal_filter(plant, reference=REFERENCE, exact=False).report.passed
+
+
 def test_a_mean_square_that_has_lost_its_digits_is_none() -> None:
     design = matched(obsynth.DescriptorSystem(**EXAMPLE))
     observer = obsynth.LinearObserver.from_dict(

@@ -22,6 +22,8 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_ri
 from obsynth.numerics.ranks import ROUNDED_ZERO, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import uncayley
 
+#: Modes of the Cayley transform nearer to -1 are infinite ones: of plants whose index is 2 or more.
+INFINITE_MODE = 1e-10
 #: White noise that passes to the error by less than this share is rounding.
 WHITE_SHARE = 1e-9
 #: Noise added to the outputs, of what the states' noise does to them, largest first.
@@ -120,6 +122,11 @@ def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (
 
     Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
     """
+    if np.min(np.abs(1.0 + np.linalg.eigvals(problem.A)), initial=np.inf) < INFINITE_MODE:
+        raise PreconditionError(
+            "The outputs show derivatives of noise or of faults, and white noise has none. Give norm hinf.",
+            condition="zeros",
+        )
     rows = len(problem.C)
     a, b, outputs, direct = uncayley(
         problem.A,
