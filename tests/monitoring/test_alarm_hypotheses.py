@@ -14,7 +14,7 @@ from obsynth.cli.main import main
 from obsynth.errors import SpecError
 from obsynth.monitoring.alarms.events import SHELVED_AFTER, AlarmLog, alarm_rows
 from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE
-from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, ranked
+from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, ranked, ranked_changes
 
 ROWS, BEGIN = 900, 500
 
@@ -216,3 +216,18 @@ def test_an_unexplained_alarm_is_shelved_until_a_fault_explains_it():
     events.take("learned", known.named, 1.5, 2020.0, 202, [0.0], ranking=known)
     (event,) = events.events()
     assert (event.fault, math.isnan(event.shelved)) == ("leak", True)
+
+
+def test_slow_changes_that_estimates_follow_are_ranked_by_their_own_likelihoods():
+    """Residuals of half a leak return to zero while the estimate follows it: the alarm had no name and no list."""
+    faults, passed = ("leak", "pump", "worn"), np.array([True, True, False])
+    found = ranked_changes(faults, np.array([[3.0, 2.0, 1.0], [30.0, 28.0, 2.0]]), passed)
+    assert found is not None
+    assert (found.named, found.ties, found.called(faults)) == ("leak", ("pump",), "")
+    assert [name for name, _ in found.shares][:2] == ["leak", "pump"]
+    assert sum(share for _, share in found.shares) == pytest.approx(1.0)
+    alone = ranked_changes(faults, np.array([[90.0, 28.0, 2.0]]), passed)
+    assert alone is not None
+    assert (alone.called(faults), alone.ties) == ("leak", ())
+    assert ranked_changes(faults, np.array([[90.0, 28.0, 2.0]]), ~np.ones(3, dtype=bool)) is None
+    assert ranked_changes(faults, np.array([[np.inf, 28.0, 2.0]]), passed) is None

@@ -56,6 +56,12 @@ def test_set_points_beyond_those_of_the_normal_log_do_not_alarm_and_are_named() 
     assert obsynth.run_on_data(design(), log(1, 5.0), monitor=without).events != ()
 
 
+def test_one_log_says_before_a_run_that_it_does_not_show_drifts_of_the_plant() -> None:
+    assert "one log does not say how far constants of the plant drift in others" in learned().statement
+    assert "three normal logs" in learned().statement
+    assert "constants of the plant" not in replace(learned(), logs=3).statement
+
+
 def test_levels_rise_beyond_the_range_by_what_the_logs_say_of_the_model_alone() -> None:
     """A model without an error that follows the input: rates are small, and a fault alarms beyond the range."""
     exact = obsynth.learn_thresholds(design(), log(0, 1.0, mismatch=0.0, rows=2000), false_alarms="1 per 200 rows")

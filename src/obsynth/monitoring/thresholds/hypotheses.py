@@ -8,10 +8,11 @@ where no effect of a fault comes near to it, the alarm is none of these faults.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, SENSOR, Ranking
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, MODEL_SHARE
@@ -81,20 +82,38 @@ def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Rankin
         ):
             del ratios[name]
     ratios[NONE_OF_THESE] = EXPLAINED_SHARE * explanation.shift
-    most = max(ratios.values())
-    if not most >= LEAST_RATIO:
+    if not max(ratios.values()) >= LEAST_RATIO:
         return None
+    shares, (named, *ties) = _shares_and_nearest(ratios)
+    size = deviation = np.nan
+    if named.startswith(SENSOR):
+        size, deviation = float(explanation.sizes[best[named]]), float(explanation.deviations[best[named]])
+    return Ranking(shares, named, tuple(ties), named in drifts, size, deviation)
+
+
+def ranked_changes(faults: Sequence[str], ratios: FloatArray, passed: NDArray[np.bool_]) -> Ranking | None:
+    """Return the ranking of slow changes of faults, of which nothing is seen in the residuals that the estimates
+    follow: by twice the log likelihood ratios ``(ages, nf)`` of a change of each, at the likeliest age; `None` where no
+    fault has ``passed (nf,)`` a level by itself."""
+    of_age = ratios[int(np.argmax(ratios.max(axis=1)))]
+    if not (passed.any() and np.isfinite(of_age).all()):
+        return None
+    by_name = dict(zip(faults, of_age.tolist(), strict=True))
+    shares, (named, *ties) = _shares_and_nearest({**by_name, NONE_OF_THESE: EXPLAINED_SHARE * float(of_age.max())})
+    return Ranking(shares, named, tuple(ties))
+
+
+def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, float], ...], list[str]]:
+    """Return posterior shares by what hypotheses explain, the largest first; and those that are as likely as the best,
+    faults of the plant first."""
+    most = max(ratios.values())
     scale = _scale(most)
     weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
     total = sum(weights.values())
     shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda hypothesis: -hypothesis[1])
     near = [name for name, _ in shares if most - ratios[name] <= DISTINGUISHED * scale]
     near.sort(key=lambda name: (name == NONE_OF_THESE, name.startswith(SENSOR)))
-    named = near[0]
-    size = deviation = np.nan
-    if named.startswith(SENSOR):
-        size, deviation = float(explanation.sizes[best[named]]), float(explanation.deviations[best[named]])
-    return Ranking(tuple(shares), named, tuple(near[1:]), named in drifts, size, deviation)
+    return tuple(shares), near
 
 
 def _scale(ratio: float) -> float:

@@ -207,7 +207,12 @@ class LearnedThresholds:
         )
 
     def _drifts_in_words(self) -> Iterator[str]:
-        """Yield which slow drifts of sensors are allowed for, and which would alarm."""
+        """Yield which slow drifts of sensors are allowed for, which would alarm, and what one log does not say."""
+        if self.logs == 1:
+            yield (
+                "one log does not say how far constants of the plant drift in others: while one is further off than in "
+                "this log, healthy rows may be in alarm; three normal logs that hold such drifts show it"
+            )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)
             why = f" (for {unknown} no noise is stated and the log shows none, or nothing is known with such a drift)"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
-from obsynth.monitoring.thresholds.hypotheses import ranked
+from obsynth.monitoring.thresholds.hypotheses import ranked, ranked_changes
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
@@ -77,6 +77,7 @@ class LearnedRule(Rule):
         self._walk = walk if learned.statistics.estimates else None
         self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
         self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
+        self._names = tuple(faults)
         self._places = np.array([names.index(name) for name in learned.columns])
         self._usual = np.array([name not in learned.seldom for name in names])
         templates = learned.statistics.templates()
@@ -158,6 +159,9 @@ class LearnedRule(Rule):
         if self.effects is not None and values.max() > 1.0:
             effects, explained = self.effects.explained(state.effects)
             state, ranking = state._replace(effects=effects), ranked(self.effects.hypotheses, explained)
+            if ranking is None and self._walk is not None:
+                by_fault = values[-2 * len(self._faults) :].reshape(2, -1)
+                ranking = ranked_changes(self._names, self._changes(state, 0.0), by_fault.max(axis=0) > 1.0)
         return state, RuleOutput(float(values.max()), 1.0, fault, (), ranking)
 
     def _followed(
