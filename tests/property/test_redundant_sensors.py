@@ -144,3 +144,15 @@ def test_a_scaled_copy_that_differs_in_the_last_digit_takes_the_place_of_no_othe
     )
     assert np.allclose(merged_outputs(plant).plant.C, c[[0, 2]], rtol=1e-12)
     assert obsynth.ui_pi_observer(plant).report.passed
+
+
+@pytest.mark.parametrize("method", ["optimal-filter", "pd-observer"])
+def test_a_fast_state_that_nothing_shows_does_not_hurry_a_default(method):
+    alone = obsynth.DescriptorSystem(A=[[-1.0]], C=[[1.0]], Bf=[[1.0]], Dw=[[0.1]])
+    beside = obsynth.DescriptorSystem(
+        A=np.diag([-1.0, -50.0]), C=[[1.0, 0.0]], Bf=[[1.0], [0.0]], Dw=[[0.1]], noise_names=alone.noise_names
+    )
+    own, more = (obsynth.design(plant, method) for plant in (alone, beside))
+    if method == "optimal-filter":
+        assert more.certificate.claims["gain"] == pytest.approx(own.certificate.claims["gain"], rel=1e-3)
+    assert noise_of(more) <= 4.0 * noise_of(own)

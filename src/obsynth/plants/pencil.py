@@ -51,10 +51,19 @@ def structure_of(plant: DescriptorSystem) -> PencilStructure:
 @remembered
 def shown_modes(plant: DescriptorSystem) -> ComplexArray:
     """Return the finite modes of a plant without those that no output shows, such as that of a state beside it."""
+    return read_only(without_hidden(plant, structure_of(plant).finite_eigenvalues), np.complex128)
+
+
+def without_hidden(plant: DescriptorSystem, modes: ComplexArray) -> ComplexArray:
+    """Return the finite modes ``(n,)`` of a plant, in whatever order, without those that no output shows."""
+    for value in _hidden_modes(plant)[: len(modes)]:
+        modes = np.delete(modes, np.argmin(np.abs(modes - value)))
+    return modes
+
+
+@remembered
+def _hidden_modes(plant: DescriptorSystem) -> ComplexArray:
     units, (moving, whole) = PlantUnits.of(plant).rounded(), in_own_units(plant)
     outputs = units.outputs[:, None] * plant.C * units.states
     hidden = finite_zeros(np.vstack([moving, np.zeros_like(outputs)]), np.vstack([whole, outputs])).values
-    modes = structure_of(plant).finite_eigenvalues
-    for value in units.eigenvalues(hidden)[: len(modes)]:
-        modes = np.delete(modes, np.argmin(np.abs(modes - value)))
-    return read_only(modes, np.complex128)
+    return read_only(units.eigenvalues(hidden), np.complex128)

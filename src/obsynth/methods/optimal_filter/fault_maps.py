@@ -28,7 +28,7 @@ from obsynth.numerics.least_mean_square import least_mean_square
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import cayley, cayley_point, finite_poles, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.pencil import regularity_of, structure_of
+from obsynth.plants.pencil import regularity_of, structure_of, without_hidden
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.fault_map_zeros import require_vanishing
 from obsynth.verification.invisible_faults import Setting, seen_plant
@@ -226,7 +226,9 @@ def _unweighted_maps(plant: DescriptorSystem, options: Options) -> Iterator[Faul
         tried = range(plant.nx + 2 if None in delays else 1)
         yield from (FaultMap(tuple(late if one is None else one for one in delays), None, True) for late in tried)
     else:
-        width = cayley_point(_finite_poles(plant, plant.E, plant.A))
+        poles = _finite_poles(plant, plant.E, plant.A)
+        shown = without_hidden(plant, poles)
+        width = cayley_point(shown if shown.size else poles)
         yield from (FaultMap(None, lag_model(width, order, plant.nf, 0.0), True) for order in range(1, plant.nx + 2))
 
 

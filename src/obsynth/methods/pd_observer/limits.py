@@ -10,7 +10,7 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -21,11 +21,20 @@ WELL_DAMPED = 0.5
 #: Well-damped modes this many times faster than the plant's pace are none of the observer's business.
 FAR_BEYOND = 100.0
 
+NO_MODES: ComplexArray = np.zeros(0, dtype=np.complex128)
 
-def fastest_mode(a: FloatArray) -> float:
+
+def fastest_shown_mode(plant: DescriptorSystem) -> float:
+    """Return `fastest_mode` of an explicit plant without the modes that no output shows, where it has others."""
+    return fastest_mode(plant.A, np.array(analyse_structure(plant).unobservable_modes))
+
+
+def fastest_mode(a: FloatArray, hidden: ComplexArray = NO_MODES) -> float:
     """Return the largest modulus of an eigenvalue to follow, damped ones far beyond left out; 1 for integrators."""
     balanced = balanced_matrix(a)[0]
     modes = np.linalg.eigvals(balanced)
+    for mode in hidden if len(hidden) < len(modes) else NO_MODES:
+        modes = np.delete(modes, np.argmin(np.abs(modes - mode)))
     sizes = np.abs(modes)
     if not np.max(sizes) > NEGLIGIBLE_MODE * largest_singular_value(balanced):
         return 1.0
@@ -44,7 +53,7 @@ def default_delta(plant: DescriptorSystem, method: PdObserver, decay: float) -> 
     if method.disk_numbers is not None:
         centre, radius = method.disk_numbers
         return 1.0 / centre if centre > 0.0 else 2.0 / (centre + radius)
-    delta = 1.0 / fastest_mode(plant.A)
+    delta = 1.0 / fastest_shown_mode(plant)
     limit = theorem_2_limit(plant, decay) if method.theorem == 2 else math.inf
     return min(delta, 0.5 * limit)
 

@@ -24,7 +24,7 @@ from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.gains import PdGains, certified
-from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
+from obsynth.methods.pd_observer.limits import default_delta, fastest_shown_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
@@ -121,7 +121,7 @@ def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdG
     plain = gains_for(plant, method, decay=0.0 if method.decay is None else float(method.decay), own=own)
     records = [plain.record]
     slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
-    target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
+    target = float(min(DECAY_SHARE * fastest_shown_mode(plant), -HIDDEN_SHARE * slowest))
     if not free or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
@@ -235,7 +235,7 @@ def _own_units(plant: DescriptorSystem) -> _Units:
     noise then reaches the estimates several times larger.  So it does by an output that hardly shows the states but for
     its noise, where that is stated: beside the others its unit is no less than its noise has it.
     """
-    units = _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
+    units = _with_faults(PlantUnits.of(plant), 1.0 / fastest_shown_mode(plant))
     noise = np.linalg.norm(plant.Dw, axis=1)
     largest_ratio = float(np.max(units.outputs[noise > 0.0] / noise[noise > 0.0], initial=0.0))
     return units._replace(outputs=np.maximum(units.outputs, largest_ratio * noise))
@@ -251,7 +251,7 @@ def _given_units(plant: DescriptorSystem) -> _Units:
 
 def _candidate_units(plant: DescriptorSystem, method: PdObserver) -> Iterator[_Units]:
     n, ny = plant.nx + plant.nf, plant.ny
-    time = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
+    time = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_shown_mode(plant)))))
     yield _given_units(plant)._replace(time=time)
     if method.gain_bound is not None:
         return  # it is a bound in the user's units
