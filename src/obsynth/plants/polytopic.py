@@ -20,6 +20,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError, a_kind
 from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.convex_hulls import spanning_points
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.other_names import plant_keywords_suggested
@@ -207,8 +208,14 @@ class PolytopicSystem:
 
     @cached_property
     def center(self) -> DescriptorSystem:
-        """The mean of the vertices."""
-        return self.mean(np.full(self.count, 1.0 / self.count))
+        """The mean of the vertices, without those that repeat one or lie among the others."""
+        spanning = spanning_points(
+            [np.concatenate([getattr(each, name).ravel() for name in SCHEDULED_MATRICES]) for each in self.vertices]
+        )
+        used = range(self.count) if spanning is None else spanning[0]
+        weights = np.zeros(self.count)
+        weights[list(used)] = 1.0 / len(used)
+        return self.mean(weights)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what it was made of, as the constructor takes it."""

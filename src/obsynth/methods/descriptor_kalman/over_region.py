@@ -23,7 +23,7 @@ from obsynth.analysis.existence.kalman import without_unknown_inputs
 from obsynth.analysis.existence.kalman_over_region import free_equations, kalman_conditions_over_region
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
-from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
+from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, analysed, certified
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
@@ -84,7 +84,7 @@ def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: 
             {"region_deviation": claim.level, "region_decay": decay},
         ),
         solver={"engine": "lmi", "runs": [*certificate.runs, *claim.runs]},
-        notes=_notes(plant, decay, steps if used else None, noise),
+        notes=(*_notes(plant, decay, steps if used else None, noise), *by_product_notes(certificate)),
     )
 
 

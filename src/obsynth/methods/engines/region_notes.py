@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from obsynth.methods.engines.vertex_certificates import NEGLIGIBLE, VertexCertificate
 from obsynth.plants.polytopic import PolytopicSystem
 
 
@@ -23,3 +24,20 @@ def unused_rate_notes(plant: PolytopicSystem, steps: float | None) -> list[str]:
         f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
         "sought for one parameter that enters linearly and cannot cross its range within a sample."
     ]
+
+
+def by_product_notes(certificate: VertexCertificate) -> list[str]:
+    """Return the notes on numbers that are proved, but are no least ones: a gain of about zero, a first decay."""
+    notes = []
+    if certificate.is_negligible:
+        notes.append(
+            "The disturbances can be decoupled: the least gain is zero but for rounding. What is proved in its place, "
+            f"{certificate.level:.3g}, is a share of what they do without any gain (the first of "
+            f"{', '.join(f'{share:g}' for share in NEGLIGIBLE)} that could be proved), and says nothing else."
+        )
+    if not certificate.is_fastest:
+        notes.append(
+            "The decay is that of the certificate of the gain. With so many states and vertices a faster one at the "
+            "same gain is not sought: state decay where you need one."
+        )
+    return notes

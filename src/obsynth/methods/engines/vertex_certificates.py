@@ -17,6 +17,7 @@ import numpy as np
 from obsynth.conditions.lmi import USABLE_STATUSES
 from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
+from obsynth.methods.engines.extreme_vertices import ExtremeVertices
 from obsynth.methods.engines.fastest_decay import MARGINS, faster, fastest_of, slower
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
@@ -71,6 +72,10 @@ class VertexCertificate:
         Records of the solver.
     output : FloatArray, optional
         V of the innovation in z, where it was free.
+    is_negligible : bool
+        Whether the least level is zero but for rounding, and ``level`` one of `NEGLIGIBLE` shares.
+    is_fastest : bool
+        Whether about the fastest decay at the level was sought, or nothing asks for it.
     """
 
     gains: list[FloatArray]
@@ -81,6 +86,8 @@ class VertexCertificate:
     proof: VertexProof
     runs: tuple[Mapping[str, Any], ...]
     output: FloatArray | None = None
+    is_negligible: bool = False
+    is_fastest: bool = True
 
     def gain_times(self, reach: float) -> float:
         """Return the level times a bound ``reach``, which no rounding of the product and its quotient brings below."""
@@ -130,16 +137,18 @@ def certified(
     SolverError
         No certificate was found.  That proves nothing: there may be one.
     """
+    extreme = ExtremeVertices.of(errors, gains) if lyapunov == "common" and steps is None else None
     search = _Search(
         errors,
-        ErrorUnits.of(errors),
+        extreme,
+        ErrorUnits.of(errors if extreme is None else extreme.errors),
         {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain, "free_output": free_output},
         gains,
         solver,
         settings,
         [],
     )
-    least, z_unit, size = _least(search.units, search.options_with(decay), gains, solver, settings, search.runs)
+    least, z_unit, size = _least(search.units, search.options_with(decay), search.given, solver, settings, search.runs)
     levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS + WIDE_ROOMS]
     if level is None and least < NEGLIGIBLE[0] * size:
         levels = [share * size for share in NEGLIGIBLE]
@@ -147,7 +156,8 @@ def certified(
         z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else power_of_two(target)
         made = search.at(target, z_unit, decay, least)
         if made is not None:
-            return _with_fast_decay(search, made, z_unit) if fast_decay and decay is None else made
+            made = _with_fast_decay(search, made, z_unit) if fast_decay and decay is None else made
+            return replace(made, is_negligible=least < NEGLIGIBLE[0] * size)
     if level is not None and level < least:
         raise SolverError(
             f"No observer with one certificate over the region was found at {level:.6g}: the least level found for "
@@ -233,12 +243,18 @@ class _Search:
     """An error system with the options under which a certificate is sought."""
 
     errors: ErrorPolytope
+    extreme: ExtremeVertices | None  # without them: inequalities at every vertex
     units: ErrorUnits
     options: dict[str, Any]
     gains: Sequence[FloatArray] | None
     solver: str
     settings: Mapping[str, Any] | None
     runs: list[dict[str, Any]]
+
+    @property
+    def given(self) -> Sequence[FloatArray] | None:
+        """Given gains at the vertices that have an inequality."""
+        return self.gains if self.extreme is None else self.extreme.given
 
     def options_with(self, decay: float | None) -> dict[str, Any]:
         """Return the options with a little more decay: what a solver leaves of its constraints is off by its
@@ -253,7 +269,7 @@ class _Search:
         errors, units, gains, steps = self.errors, self.units, self.gains, self.options["steps"]
         moved = units.moved(z_unit)
         problem = vertex_inequalities(
-            moved, level=level / z_unit, gains=units.gains_in(gains), **self.options_with(decay)
+            moved, level=level / z_unit, gains=units.gains_in(self.given), **self.options_with(decay)
         )
         if not has_numbers(problem, self.solver, self.settings, self.runs):
             return None
@@ -266,12 +282,17 @@ class _Search:
         V = problem.variables["V"].value * z_unit / units.outputs if "V" in problem.variables else None
         whole = errors if V is None else errors.with_innovation(V)
         for each in candidates:
-            made = [units.gain_out(L) for L in each] if gains is None else [np.asarray(L, np.float64) for L in gains]
+            made = self._shipped(each) if gains is None else [np.asarray(L, np.float64) for L in gains]
             proof = self._proof(whole, made, witness, level)
             rate = proved_decay(errors, made, witness, required=decay) if proof.proved else None
             if rate is not None and (decay is None or (rate <= decay if errors.dt > 0.0 else rate >= decay)):
                 return VertexCertificate(made, witness, level, least, rate, proof, tuple(self.runs), V)
         return None
+
+    def _shipped(self, gains: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return gains in the units of the plant, at every vertex."""
+        made = [self.units.gain_out(L) for L in gains]
+        return made if self.extreme is None else self.extreme.gains(made)
 
     def _proof(self, whole: ErrorPolytope, gains: list[FloatArray], witness: Witness, level: float) -> VertexProof:
         vertices, discrete = whole.closed(gains), whole.dt > 0.0
@@ -288,8 +309,8 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
     errors, units = search.errors, search.units
     if errors.dt <= 0.0 or search.gains is not None or errors.ball:
         return first
-    if errors.order**3 * errors.count > MOST_FAST or errors.count > MOST_FAST_VERTICES:
-        return first
+    if errors.order**3 * units.errors.count > MOST_FAST or units.errors.count > MOST_FAST_VERTICES:
+        return replace(first, is_fastest=False)
     moved, steps, s = units.moved(z_unit), search.options["steps"], units.states / z_unit
     start = fastest_of(errors, first.gains, first.witness)
     if start is None:
@@ -345,6 +366,7 @@ def best_decay(
     gains: Sequence[FloatArray] | None = None,
     limit: float = 1e3,
     slowest: float = 1.0,
+    margins: Sequence[float] | None = None,
     **options: Any,
 ) -> tuple[float, Witness, list[FloatArray]]:
     """Return the fastest decay that is proved, its certificate and gains.
@@ -360,6 +382,9 @@ def best_decay(
 
     slowest : float, optional
         In discrete time the slowest decay (above 1: growth) that is tried.
+    margins : sequence of float, optional
+        Shares by which what ships is slower, in turn, with the largest slack; by default a few of gains that are
+        sought, none of given ones.
     **options
         ``lyapunov``, ``steps`` and ``gain`` as for `obsynth.conditions.vertex_inequalities`.
 
@@ -368,9 +393,11 @@ def best_decay(
     SolverError
         No decay at all is proved.
     """
-    discrete = errors.dt > 0.0
-    units = ErrorUnits.of(errors)
-    moved, steps, own = units.moved(1.0), options.get("steps"), units.gains_in(gains)
+    discrete, steps = errors.dt > 0.0, options.get("steps")
+    common = options.get("lyapunov", "common") == "common" and steps is None
+    extreme = ExtremeVertices.of(errors, gains) if common else None
+    units = ErrorUnits.of(errors if extreme is None else extreme.errors)
+    moved, own = units.moved(1.0), units.gains_in(gains if extreme is None else extreme.given)
     Solution = tuple[Witness, list[FloatArray]]
 
     def solved(rate: float, earlier: Solution | None) -> tuple[float, Solution] | None:
@@ -389,9 +416,11 @@ def best_decay(
     start = solved(slowest if discrete else 0.0, None)
     if start is not None:
         reached = faster(solved, *start, discrete=discrete)
-        near = () if gains else slower(reached[-1][0], MARGINS, 1.0 if discrete else None)
+        shares = margins if margins is not None else () if gains else MARGINS
+        near = slower(reached[-1][0], shares, 1.0 if discrete else None)
         for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
-            made = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
+            sought = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
+            made = sought if extreme is None or gains is not None else extreme.gains(sought)
             witness = units.witness_out(inner, 1.0)
             fastest, end = (min(rate, slowest), slowest) if discrete else (min(rate, limit), None)
             for trial in slower(fastest, DECAY_SHARES, end):

@@ -18,7 +18,7 @@ from obsynth.analysis.existence.turning_filter import TurningFilter
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
+from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified_for_steps
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
@@ -189,6 +189,7 @@ def _notes(
 ) -> tuple[str, ...]:
     notes = [certificate_note(plant, f"{rows_to_forget(certificate.decay)} rows")]
     notes += unused_rate_notes(plant, steps if certificate.witness.G is not None else None)
+    notes += by_product_notes(certificate)
     if parts.reach != 1.0:
         notes.append(
             f"The effect of the faults changes with the scheduling: the estimates are divided by it, and gamma is the "

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.analysis.existence.turning_filter import TurningFilter, pairs_of_vertices
 from obsynth.errors import SolverError
-from obsynth.methods.engines.region_notes import certificate_note, unused_rate_notes
+from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.method import Synthesis
@@ -50,7 +50,7 @@ def synthesise_turning(
         observer=observer,
         certificate=Certificate({"tracking": parts.T, **stored_witness(certificate.witness)}, claims),
         solver={"engine": "lmi", "runs": list(certificate.runs)},
-        notes=_notes(plant, parts, observer.forgetting),
+        notes=(*_notes(plant, parts, observer.forgetting), *by_product_notes(certificate)),
     )
 
 

@@ -20,8 +20,15 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_free_gains, pi_over_region
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.rated_certificates import rated_certificate, rated_gains
-from obsynth.methods.engines.region_notes import certificate_note
-from obsynth.methods.engines.vertex_certificates import VertexCertificate, analysed, certified, proved_decay
+from obsynth.methods.engines.region_notes import by_product_notes, certificate_note
+from obsynth.methods.engines.vertex_certificates import (
+    DECAY_MARGINS,
+    VertexCertificate,
+    analysed,
+    best_decay,
+    certified,
+    proved_decay,
+)
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
@@ -30,6 +37,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, forgetting_of, stored_witness
@@ -166,6 +174,8 @@ def _synthesis(
     required_decay = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
     required = required_decay or (certificate.decay if plant.dt > 0.0 else certificate.decay / parts.units.time)
     shrinking = proved_decay(shipped.errors, shipped.none, witness, required=required)
+    if not plant.is_discrete:
+        witness, shrinking = _of_its_own(shipped, parts.units.time, witness, shrinking)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
     matrices |= stored_witness(witness)
     claims, runs, slow = {"region_decay": shrinking}, list(certificate.runs), None
@@ -194,8 +204,26 @@ def _synthesis(
             shrinking,
             used=used_rate,
             constant=len(certificate.gains) == 1,
-        ),
+        )
+        + tuple(by_product_notes(replace(certificate, is_negligible=False))),
     )
+
+
+def _of_its_own(shipped: _Shipped, time: float, witness: Witness, decay: float) -> tuple[Witness, float]:
+    """Return a Lyapunov matrix for the decay alone in continuous time, of the same gains, where it proves a faster one.
+
+    The matrix of the gain proves some decay, which depends on where the solver ends; a little below the fastest one
+    that has the largest slack is a number of the gains.
+    """
+    scaled = replace(shipped.errors, A=[time * A for A in shipped.errors.A])
+    # No rate is faster than the slowest mode at a vertex.
+    limit = min(-float(np.max(np.linalg.eigvals(A).real)) for A in scaled.A)
+    try:
+        found, own, _ = best_decay(scaled, gains=shipped.none, limit=limit, margins=DECAY_MARGINS)
+    except SolverError:
+        return witness, decay
+    faster = proved_decay(shipped.errors, shipped.none, own, required=found / time)
+    return (own, faster) if faster > decay else (witness, decay)
 
 
 @dataclass(frozen=True, eq=False)
