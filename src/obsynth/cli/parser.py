@@ -1,4 +1,4 @@
-"""Command-line parsing: an `argparse` parser whose refusals say what may be meant."""
+"""Command-line parsing: an `argparse` parser whose messages suggest the option that is meant."""
 
 from __future__ import annotations
 

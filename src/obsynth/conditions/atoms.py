@@ -1,4 +1,4 @@
-"""The inequalities of which all the papers' conditions are made, each with its lemma.
+"""Matrix inequalities that the papers' conditions share, each with its lemma.
 
 ``A, B, C, D`` are those of ``e+ = A e + B w``, ``z = C e + D w`` (``e+`` is e' for ``dt = 0``).  For a gain L that is
 still to be found, ``A - L Cy`` and ``B - L Dy``, give the variable ``Y = P L`` with ``Cy`` and ``Dy``: then P A stands

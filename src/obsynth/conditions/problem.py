@@ -1,4 +1,4 @@
-"""What every source of conditions returns: a problem to read, to change and to solve, and the way to a design."""
+"""The public class of conditions: a cvxpy problem to read, change and solve, and the design of its solution."""
 
 from __future__ import annotations
 

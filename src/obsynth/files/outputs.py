@@ -1,4 +1,4 @@
-"""The one writer: files appear whole or not at all, never over what was read, and over others only if told."""
+"""Writing files: whole or not at all, never over inputs, and over other files only where the caller allows it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a design does to faults, unknown inputs and noise, in closed form on one clock; no random numbers.
+"""Effects of faults, unknown inputs and noise on the estimates of a design, in closed form at one sample time.
 
 The plant is sampled, with faults and unknown inputs held between samples; the error of an estimate is followed from
 one impulse at each input, so that plants with modes on the boundary need no stationary covariance.

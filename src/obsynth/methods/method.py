@@ -1,4 +1,4 @@
-"""What a method is: one frozen class whose fields are its options; and what it hands to the pipeline."""
+"""The base class of methods, whose fields are the options, and the result that a method returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What would make a refused design possible, found by asking again; and designs that rounding makes useless.
+"""Remedies for a refused design, each tried; and designs that rounding makes useless.
 
 Outputs ``y = G f`` right to the last digit change an estimate by up to ``u (|Cz| |(s - Az)^-1| |By| + |Dy|) |G| |f|``,
 u the unit roundoff, in any units; the observer's own numbers, with z its state, by up to

@@ -1,4 +1,4 @@
-"""What states of its plant a linear observer follows, of any method that has an error model."""
+"""The states of its plant that a linear observer follows, of any method that has an error model."""
 
 from __future__ import annotations
 

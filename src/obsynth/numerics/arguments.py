@@ -1,4 +1,4 @@
-"""What a caller gives, checked: never a raw TypeError, always the name of the argument.
+"""Arguments of callers, checked: never a raw TypeError, always with the name of the argument.
 
 Types of option values with their ranges: stated once, read by constructors, by options and by the spec's schema.
 """

@@ -1,4 +1,4 @@
-"""A small arithmetic language for data: Python parses it, and of its tree known operations are read, nothing else.
+"""A small arithmetic language for data: Python parses it, and only known operations of its tree are read.
 
 Numbers, names, ``+ - * / **``, parentheses, a fixed list of functions, and ``where(a > b, c, d)``, which is c where
 a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative with respect to time of any expression.

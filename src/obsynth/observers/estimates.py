@@ -1,4 +1,4 @@
-"""What an observer says: estimates with their names and delays, and how far they may be off where it knows."""
+"""Estimates of an observer with their names and delays, and their standard deviations where it has them."""
 
 from __future__ import annotations
 

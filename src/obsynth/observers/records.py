@@ -1,4 +1,4 @@
-"""Checking what an observer is made of, and the samples and records it is given."""
+"""Checks of the numbers of an observer, and of the samples and records that it takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The samples of a run as a chain that can be followed backwards: what the end of a record says of its beginning."""
+"""The samples of a run as a chain for backward smoothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checking what a plant is made of: every problem is collected before one error is raised."""
+"""Checks of the fields of a plant: every problem is collected before one error is raised."""
 
 from __future__ import annotations
 

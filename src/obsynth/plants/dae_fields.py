@@ -1,4 +1,4 @@
-"""What a nonlinear differential-algebraic plant is given by: equations, outputs and signals, as texts or functions."""
+"""The fields of a nonlinear differential-algebraic plant: equations, outputs and signals, as texts or functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The matrices of a plant as rational numbers: as written, or as exact arithmetic on what is written found them."""
+"""The matrices of a plant as rational numbers: as written, or computed from these by exact arithmetic."""
 
 from __future__ import annotations
 

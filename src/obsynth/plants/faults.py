@@ -1,4 +1,4 @@
-"""What is known about the course of faults: an exosystem ``w+ = Phi w, f = Cw w`` for each, stacked block-diagonally.
+"""Fault models: an exosystem ``w+ = Phi w, f = Cw w`` for each fault, stacked block-diagonally.
 
 Share Pasand, Aliyari, Taghirad, (2), (5), (6), where the row of (6) would add faults up.  ``f = Cw w``, not
 ``f' = Phi f``; the states of a polynomial are f, f', f'', ..., initial values ``i! f_i``.

@@ -1,4 +1,4 @@
-"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
+"""The fields of a linear plant from arguments of callers: labelled frames, names for rows, noise of sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is uncertain in a linear plant: constants in its matrices, as written, and the transformations since."""
+"""The uncertainty of a linear plant: constants in its matrices, as written, and the transformations since."""
 
 from __future__ import annotations
 

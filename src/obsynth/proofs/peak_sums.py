@@ -1,4 +1,4 @@
-r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
+r"""Upper bounds on sums over all time of impulse responses, with all rounding bounded.
 
 ``c_{j+1} = fl(c_j M)`` misses ``c_j M`` by a known defect; with a proved `Contraction` all later terms gain no more
 than ``sum |defect Q^-1| |Q b| / (1 - rate)``, and what follows the last computed one is that of ``|c_N Q^-1|``.

@@ -1,4 +1,4 @@
-"""A finished design for people: what its plant is, what it promises, and what it may still not do."""
+"""The printed report of a design: its plant, its claims, and its limits."""
 
 from __future__ import annotations
 

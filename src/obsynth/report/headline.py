@@ -1,4 +1,4 @@
-"""What a page says first: what can be detected, how small, how soon, and with which rate of false alarms."""
+"""The head of a page: which faults can be detected, how small, how soon, with which rate of false alarms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A finished design in about twelve lines: what it is, what each fault estimate is worth, what it rests on."""
+"""The summary of a design in about twelve lines: method, claims, quality of each fault estimate, assumptions."""
 
 from __future__ import annotations
 

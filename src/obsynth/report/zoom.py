@@ -1,4 +1,4 @@
-"""Plots of a page that can be zoomed: uPlot and the data stand in the page, which needs no network."""
+"""Plots of a page that can be zoomed: uPlot and the data are in the page, which needs no network."""
 
 from __future__ import annotations
 

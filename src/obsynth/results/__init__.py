@@ -1,4 +1,4 @@
-"""What a design is: the design, its certificate and report, and the gain set as a file.
+"""Results: the design, its certificate and report, and the gain set as a file.
 
 Main names: `ObserverDesign`, `Certificate`, `VerificationReport`, `Check`, `load`.
 """

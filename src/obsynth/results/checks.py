@@ -1,4 +1,4 @@
-"""The rows of a verification report: what is claimed, the number that was found, and whether it holds."""
+"""The rows of a verification report: the claim, the recomputed number, and whether it holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The result of every method: what was asked, what is shipped, and the proof."""
+"""The result of every method: its options, the gains and the observer, and the certificate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions of upper rooms that methods of results call: registered by `obsynth`, which stands above every room."""
+"""Functions of upper rooms that methods of results call: registered by `obsynth`, which is above every room."""
 
 from __future__ import annotations
 

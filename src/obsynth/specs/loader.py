@@ -1,4 +1,4 @@
-"""From a spec file to a plant that a method can use, transformed as asked, and a scenario that can be simulated."""
+"""Specs loaded: a plant that a method can use, transformed as the spec says, and a scenario to simulate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What to write in a spec instead of a value, or a key, that it does not take: sentences for messages, after a blank.
+"""Suggestions for values and keys that a spec does not take: sentences for messages, after a blank.
 
 Every sentence names the text to write; it is empty where none is certain.
 """

@@ -1,4 +1,4 @@
-"""What a spec says of a plant: its matrices, its noise, the tolerances of its constants, and how it is transformed.
+"""Schema of plants in a spec: matrices, noise, tolerances of constants, and transformations.
 
 This module imports pydantic, so it is imported only when a spec is read.
 """

@@ -1,4 +1,4 @@
-"""What some specs say: of plants that change with time, of nonlinear ones, and of logs.
+"""Schema of further sections of a spec: time-varying plants, nonlinear plants, and logs.
 
 This module imports pydantic, so it is imported only when a spec has such a section.
 """

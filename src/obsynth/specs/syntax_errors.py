@@ -1,4 +1,4 @@
-"""What a YAML reader says of a document that it cannot read: the place, the line, and what to write instead."""
+"""Messages on documents that are no YAML: the place, the line, and what to write instead."""
 
 from __future__ import annotations
 

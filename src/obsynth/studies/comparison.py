@@ -1,4 +1,4 @@
-"""What `obsynth.compare` returns: one row per method, one recommendation, one picture."""
+"""The result of `obsynth.compare`: one row per method, one recommendation, one picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beside every method's threshold the least that any test can have: same bounds, same delay, same faults left out."""
+"""The least threshold of any test beside that of every method: same bounds, same delay, same faults decoupled."""
 
 from __future__ import annotations
 

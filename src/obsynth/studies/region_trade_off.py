@@ -1,4 +1,4 @@
-"""What a larger region, or a faster parameter, costs: the proved claim of a design for each."""
+"""The trade-off of a larger region, or a faster parameter: the proved claim of a design for each."""
 
 from __future__ import annotations
 

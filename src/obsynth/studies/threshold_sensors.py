@@ -1,4 +1,4 @@
-"""Which sensors, sample time and number of samples let a fault of a given size be found: by least thresholds."""
+"""Sensors, sample time and number of samples that let a fault of a given size be detected: by least thresholds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tolerances cost: false alarms and the least fault that is found, of a fixed bound and of an adaptive one."""
+"""The tolerance study: false alarms and the least detected fault, of a fixed bound and of an adaptive one."""
 
 from __future__ import annotations
 

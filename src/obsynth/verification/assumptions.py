@@ -1,4 +1,4 @@
-"""What a statement rests on, in words that an auditor can sign: bounds, start, constants, log, gain set."""
+"""The assumptions of a statement in words that an auditor can sign: bounds, start, constants, log, gain set."""
 
 from __future__ import annotations
 

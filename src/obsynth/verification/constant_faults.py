@@ -1,4 +1,4 @@
-r"""The estimate of a constant fault in the end, enclosed: what plant and stored observer make of it together.
+r"""The steady-state estimate of a constant fault, enclosed, for the plant with the stored observer.
 
 With ``lambda = 1`` (0 in continuous time), x the plant's state under a constant fault f, and z the observer's,
 

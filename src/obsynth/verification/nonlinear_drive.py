@@ -1,4 +1,4 @@
-"""What drives the errors of an observer over a region, and which of them count: from its options, as matrices."""
+"""Inputs and outputs of the error system of an observer over a region, from its options, as matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is checked of every linear observer, whichever method made it: its signals fit the plant, and its state decays.
+"""Checks of every linear observer, of any method: its signals fit the plant, and its state decays.
 
 A method's own rows may be anything; these follow from the plant and the stored numbers alone.
 """

@@ -1,4 +1,4 @@
-"""What the options of a design ask for in numbers, against what its stored numbers reach: decay, region, poles, gains.
+"""Limits that the options of a design state (decay, region, poles, gains), against what its stored numbers reach.
 
 A design that is read from a file is printed with its options.  A rate, a region or a gain that was asked for and is not
 reached would be read as if it were.

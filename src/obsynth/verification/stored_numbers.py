@@ -1,4 +1,4 @@
-"""What the stored numbers of a linear design add to the errors: the identities hold to rounding, not exactly.
+"""Errors from the stored numbers of a linear design, for which the identities hold to rounding and not exactly.
 
 Rows bound the errors per unit of states and known inputs; where the plant is not stable, no finite gain from the
 disturbances exists, and what can be said is after how long it matters.

@@ -1,4 +1,4 @@
-"""Verified designs of the gains that somebody's solution of a paper's conditions has."""
+"""Verified designs from a user's solution of a paper's conditions."""
 
 from __future__ import annotations
 

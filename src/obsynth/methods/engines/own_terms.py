@@ -1,4 +1,4 @@
-"""Designs whose inequality holds something of one's own: constraints, an objective, a region for the eigenvalues.
+"""Designs whose inequality has the user's own terms: constraints, an objective, a region for the eigenvalues.
 
 The methods leave these to the problem as it stands in the paper: solved as it is here, gains taken from it, and the
 realisation and certificate of these gains made as for any others.  `verify` knows nothing of how they were found.

@@ -1,4 +1,4 @@
-"""What the notes of every design over the region of a polytopic plant say."""
+"""Notes of every design over the region of a polytopic plant."""
 
 from __future__ import annotations
 

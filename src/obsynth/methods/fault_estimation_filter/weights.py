@@ -1,4 +1,4 @@
-"""What a free residual weight W is worth, and what it costs: gains and noise with the paper's W and with a free one."""
+"""The free residual weight W against the paper's: gains and noise with each."""
 
 from __future__ import annotations
 

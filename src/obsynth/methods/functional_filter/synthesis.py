@@ -1,4 +1,4 @@
-"""Functional filter: estimates of the faults asked for, or residuals that show them, and nothing else.
+"""The functional filter: estimates of chosen faults, or residuals that they affect.
 
 After `decouple` a Kalman filter on inputs u *and* y, faults as walks of their models.  Source: ours; null space: Frisk,
 Nyberg (2001); fixed lag: Anderson, Moore (1979, ch. 7).

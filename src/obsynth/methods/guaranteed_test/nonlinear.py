@@ -1,4 +1,4 @@
-"""Guaranteed tests of nonlinear plants: of the sampled linear model, with what it leaves out as a disturbance."""
+"""Guaranteed tests of nonlinear plants: of the sampled linear model, with its remainder as a disturbance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options of a guaranteed test, each with its range; what they mean says the method."""
+"""The options of a guaranteed test, each with its range; the method's docstring has their meaning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the options of a guaranteed test ask of a plant: the windows, and the programme of each row."""
+"""The problem of a guaranteed test from its options: the windows, and the programme of each row."""
 
 from __future__ import annotations
 

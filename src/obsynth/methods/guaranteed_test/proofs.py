@@ -1,4 +1,4 @@
-"""What a window of samples proves: what shipped multipliers promise, what a witness shows, and why there is no test.
+"""Proofs for a window of samples: thresholds by multipliers, lower bounds by a witness, and why there is no test.
 
 Shipped doubles satisfy the equations of the window up to rounding: `nearby_solutions` bounds the distance to an exact
 solution, and what bounds hold for every number within that distance holds for the exact one.

@@ -1,4 +1,4 @@
-"""What the threshold of a nonlinear plant rests on: its region, and the bound on what its linear model leaves out."""
+"""The assumptions of the threshold of a nonlinear plant: its region, and the bound on the linearisation remainder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a window is about: the fault and the bounds that it asks for, and the matrices of its samples."""
+"""The model of a window: the fault, the bounds, and the matrices of its samples."""
 
 from __future__ import annotations
 

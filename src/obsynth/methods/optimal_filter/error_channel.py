@@ -1,4 +1,4 @@
-"""What drives the error of an optimal filter: the noise, and the faults where these pass by no exact map."""
+"""Inputs of the error of an optimal filter: the noise, and the faults where their map is not exact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference models: what the estimate shall be of the faults, as matrices."""
+"""Reference models, from the faults to their wanted estimate, as matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""What the certificate of a PD observer must hold, and proofs of its inequalities with all rounding bounded.
+r"""The inequalities of the certificate of a PD observer, proved with all rounding bounded.
 
 Theorem 1 of Filasova, Krokavec, Serbak, (40)-(43) with Y = P3' J, Z = P3' L, ``D = I + L C``, ``Ae = A - J C``:
 

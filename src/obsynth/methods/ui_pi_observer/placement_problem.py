@@ -1,4 +1,4 @@
-"""The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
+"""The placement problem of an unknown-input PI observer: decoupled inputs, movable poles, and the noise.
 
 Share Pasand, Aliyari, Taghirad, Lemma 5, procedure 1; ours are the weights and the joint design over K and Z: their
 free matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.

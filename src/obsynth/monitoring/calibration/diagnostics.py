@@ -1,4 +1,4 @@
-"""What whitened innovations say of a model: their size, whiteness and mean; and whether a log agrees with a design."""
+"""Tests of whitened innovations: size, whiteness and mean; and whether a log agrees with a design."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What explains innovations that are not white: an offset, correlated noise, a delay of an input, or one constant.
+"""Explanations of innovations that are not white: an offset, correlated noise, a delay of an input, or one constant.
 
 Each candidate is one regression of the innovations, in their own deviations.  Its gain in nats is that of the Gaussian
 likelihood less half a logarithm of the number of rows for each coefficient (Schwarz 1978), so that candidates with

@@ -1,4 +1,4 @@
-"""What a step of backward Euler errs on a log, against the noise of the sensors: how the model is to be integrated."""
+"""The error of backward Euler on a log, against the noise of the sensors: it decides how the model is integrated."""
 
 from __future__ import annotations
 

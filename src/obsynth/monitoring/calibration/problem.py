@@ -1,4 +1,4 @@
-"""The problem of a calibration, checked: a model with unknown constants, a log, priors and what is known of noise."""
+"""The problem of a calibration, checked: a model with unknown constants, a log, priors and known variances."""
 
 from __future__ import annotations
 

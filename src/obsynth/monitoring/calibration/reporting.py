@@ -1,4 +1,4 @@
-"""From a fit to a calibration: tables by name, checks of the innovations, and a sentence for each thing found."""
+"""The result of a calibration from a fit: tables by name, tests of the innovations, and sentences on both."""
 
 from __future__ import annotations
 

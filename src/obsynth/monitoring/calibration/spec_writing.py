@@ -1,4 +1,4 @@
-"""A spec with what a calibration found: constants, boxes, noise and steps, so that every command uses the same."""
+"""A spec with the result of a calibration: constants, boxes, noise and steps, so that every command uses the same."""
 
 from __future__ import annotations
 

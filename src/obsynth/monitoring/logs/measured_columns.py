@@ -1,4 +1,4 @@
-"""What the columns of a log measure: infinite cells, which count as missing, and columns without any number."""
+"""Columns of a log that measure nothing, and infinite cells, which count as missing."""
 
 from __future__ import annotations
 

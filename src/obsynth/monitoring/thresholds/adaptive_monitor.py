@@ -1,4 +1,4 @@
-"""From a design with tolerances to an adaptive threshold, and the sentence that says what it promises."""
+"""The adaptive threshold of a design with tolerances, and the statement of its guarantee."""
 
 from __future__ import annotations
 

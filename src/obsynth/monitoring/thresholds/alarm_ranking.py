@@ -1,4 +1,4 @@
-"""What an alarm may be, the most likely first."""
+"""The hypotheses on an alarm, the most likely first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an alarm may be: a fault of the plant, a fault of a sensor, or none of these, ranked by posterior shares.
+"""Hypotheses on an alarm: a fault of the plant, a fault of a sensor, or neither, ranked by posterior shares.
 
 Each hypothesis is a jump, or a straight drift, of one fault or of one sensor's offset. Twice the log likelihood ratio
 that it reaches, at its likeliest begin, is compared with those of the others (Willsky & Jones 1976); all are equally

@@ -1,4 +1,4 @@
-"""Learned thresholds: what is kept of rows without faults, in words and in files."""
+"""Learned thresholds: the result of learning from rows without faults, in words and in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Short stretches of rows without faults that raise learned levels: what they are, and by how much."""
+"""Short stretches of rows without faults that raise learned levels: their explanation, and by how much."""
 
 from __future__ import annotations
 

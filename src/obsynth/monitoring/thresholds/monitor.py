@@ -1,4 +1,4 @@
-"""Monitors: a statistic, a threshold, and a sentence that says what it promises; ``init`` and ``step``.
+"""Monitors: a statistic, a threshold and a statement of its guarantee, run by ``init`` and ``step``.
 
 A record is a scan of it, many runs are an axis before the signals, and the horizon is a number of samples or none.
 """

@@ -1,4 +1,4 @@
-r"""What the residual of a scheduled design never passes without a fault, for every course of its parameters.
+r"""Guaranteed thresholds of scheduled designs, for every trajectory of their parameters.
 
 With bounded inputs w (each at most one) the residual of ``e+ = M(mu) e + B(mu) w``, ``r = C e + D w`` after k samples
 

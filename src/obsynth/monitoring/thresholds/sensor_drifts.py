@@ -1,4 +1,4 @@
-"""Slow drifts of sensors that are allowed for: what they do to statistics, whether the logs show any or not.
+"""Allowed slow drifts of sensors: their effect on statistics, whether the logs show any or not.
 
 A log without faults holds one drift of each sensor, or none; a later one may have another.  Each sensor may be off by
 so many deviations of its noise, slowly.  What that does to a linear observer's rows is a matrix, its steady state;

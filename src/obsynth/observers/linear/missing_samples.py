@@ -1,4 +1,4 @@
-"""Missing samples of a linear observer: the plant's model stands in for the sensors, and when its traces are gone."""
+"""Missing samples of a linear observer: the plant's model replaces the sensors, until its effect has decayed."""
 
 from __future__ import annotations
 

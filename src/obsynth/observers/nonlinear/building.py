@@ -1,4 +1,4 @@
-"""An observer of a DAE from a model and plain options, and what is known of it from a run at nominal inputs.
+"""An observer of a DAE from a model and plain options, with facts from a run at nominal inputs.
 
 Used to design one, and to check the one that was shipped.
 """

@@ -1,4 +1,4 @@
-"""An observer of a DAE as C99 or a shared library: CasADi writes its graph, around it stands the loop of Newton.
+"""An observer of a DAE as C99 or a shared library: the graph by CasADi, and the loop of Newton around it.
 
 The loop is that of `obsynth.numerics.newton` and `obsynth.plants.implicit_step`; outliers, jumps, bounds of states and
 sensors of their own times are those of `obsynth.observers.nonlinear`.

@@ -1,4 +1,4 @@
-"""A whole record through the compiled kernel: where it is chosen, and what it is given."""
+"""Records run by the compiled kernel: when it is chosen, and its arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recursive observer knows at a sample, and its state before the next one."""
+"""The estimates of a recursive observer at a sample, and its state before the next one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recursive observer is made of: plant, noise, start, and how parameters are estimated; all of it checked."""
+"""The recursive observer: plant, noise, start, and how parameters are estimated, all checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which inputs of somebody's model are known, which are faults, and which are unknown."""
+"""Roles of the inputs of an imported model: known inputs, faults, and disturbances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulation in one picture: faults against estimates, and what monitors and decisions saw."""
+"""Pictures of a simulation: faults against estimates, statistics of monitors, and decisions."""
 
 from __future__ import annotations
 

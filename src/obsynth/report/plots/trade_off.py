@@ -1,4 +1,4 @@
-"""Pictures of what one claim costs in another: gain against delay, region, rate or a swept entry."""
+"""Pictures of trade-offs: one claim against another, a delay, a region, a rate or a swept entry."""
 
 from __future__ import annotations
 

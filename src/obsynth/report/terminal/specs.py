@@ -1,4 +1,4 @@
-"""What verbs that read a spec have in common: the design, made or loaded, its scenario, and where to write."""
+"""Functions of the verbs that read a spec: the design, made or loaded, its scenario, and output files."""
 
 from __future__ import annotations
 

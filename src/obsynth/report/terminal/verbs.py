@@ -1,4 +1,4 @@
-"""What a verb of the command line is: its help, its arguments, and the function that runs it."""
+"""A verb of the command line: its help, its arguments, and the function that runs it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What the recursive methods share: synthesis, steady state, and the checks of their covariances."""
+"""Parts that the recursive methods share: synthesis, steady state, and the checks of their covariances."""

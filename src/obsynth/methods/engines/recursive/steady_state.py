@@ -1,4 +1,4 @@
-"""What is proved of the listed gains of a recursive observer, were they kept, where plant and noise stay the same.
+"""Proofs on the last listed gains of a recursive observer, used as constant gains, where plant and noise are constant.
 
 The gains make errors of mean zero, errors decay, and the covariance that they reach is enclosed: the filter's own,
 whose gains move on, ends at or below it.

@@ -1,4 +1,4 @@
-"""What the recursive methods have in common: noise that the plant states, gains to read, claims, notes."""
+"""Functions of all recursive methods: noise that the plant states, gains to read, claims, notes."""
 
 from __future__ import annotations
 
