@@ -15,14 +15,27 @@ PARTS = 4
 
 #: A case of these takes many seconds.
 LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers", "switched_regions", "switched_slopes"}
-NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in frame.campaign_names()]
+#: The parts of the others whose case takes half a second or more, where another part's takes less.
+LONG_PARTS = {
+    ("adaptive_thresholds", 1), ("adaptive_thresholds", 2), ("chain_plants", 1), ("mutated_files", 3),
+    ("random_tolerances", 2), ("recursive_existence", 0), ("regions", 1), ("regions", 3), ("sentences", 2),
+    ("static_and_chains", 1), ("static_and_chains", 2), ("static_and_chains", 3), ("tampered_claims", 0),
+    ("tampered_claims", 3),
+}  # fmt: skip
+#: Name and part of each share.
+SHARES = [
+    pytest.param(name, part, marks=[pytest.mark.long] * long, id=f"{name}-{part}")
+    for name in frame.campaign_names()
+    for part in range(PARTS)
+    for long in [name in LONG or (name, part) in LONG_PARTS]
+]
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "part"), SHARES)
 def test_a_share_of_the_campaign(name, part, share):
     campaign = frame.load_campaign(name)
-    outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 64))
+    seeds = list(frame.share_of(campaign))[part::PARTS]
+    outcomes = frame.run_campaign(campaign, share(seeds, 64, together=(name, part) in LONG_PARTS))
     wrong = {seed: outcome for seed, outcome in outcomes.items() if outcome.wrong}
     assert not wrong, wrong
 

@@ -364,6 +364,7 @@ class TestRealProcesses:
         assert "searching" in done.stderr
         assert [path.name for path in tmp_path.iterdir()] == ["wang2015.gains.json"]
 
+    @pytest.mark.long
     def test_error(self, tmp_path: Path) -> None:
         (tmp_path / "spec.yaml").write_text(IMPOSSIBLE, encoding="utf-8")
         done = run("design", "--system", "spec.yaml")

@@ -127,7 +127,7 @@ class TestOtherFiles:
     CASES = ((SIMULATE, "o.csv"), (REPORT, "o.html"), (DESIGN, "o.json"), (EXPORT, "o.c"), (EXPORT, "o.npz"),
              (EXPORT, "o.mat"), (RUN, "o.csv"))  # fmt: skip
 
-    @pytest.mark.one_in(3)
+    @pytest.mark.one_in(7)
     @pytest.mark.parametrize(("words", "name"), CASES)
     def test_the_own_kind_is_replaced_others_by_force_only(self, words, name, capsys):
         assert main([*words, name]) == 0

@@ -135,7 +135,7 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.mark.one_in(12)
+@pytest.mark.one_in(20)
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_run_thresholds_validate_and_smoothing_take_each_flaw(
@@ -231,7 +231,7 @@ def errors(kind: str, flaw: str) -> tuple[dict[str, float], tuple[str, ...]]:
     return {entry.method: entry.faults[0].rms for entry in found.methods if not entry.refused}, found.notes
 
 
-@pytest.mark.one_in(12)
+@pytest.mark.one_in(20)
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("kind", ["linear", "recursive"])
 def test_comparisons_have_the_errors_of_the_clean_log_with_each_flaw(kind: str, flaw: str) -> None:
@@ -251,7 +251,7 @@ def test_comparisons_have_the_errors_of_the_clean_log_with_each_flaw(kind: str, 
     assert (len(notes), bool(told)) == (1 if told else 0, any(told in note for note in notes) if told else False)
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(15)
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_calibrations_find_the_noise_of_the_clean_log_with_each_flaw(folder: Path, kind: str, flaw: str) -> None:

@@ -70,6 +70,7 @@ def test_a_normal_log_is_learned_from_by_each(place: Path, tmp_path: Path):
     assert {run.fault for name, run in found.items() if name.endswith("leak")} == {"leak"}
 
 
+@pytest.mark.long
 def test_thresholds_that_are_missing_are_told(place: Path, tmp_path: Path):
     (tmp_path / "none").mkdir()
     found = obsynth.run_fleet(

@@ -20,6 +20,7 @@ def random_plant(nx: int, *, nd: int, seed: int, feedthrough: bool = False) -> o
     )
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("coordinates", ["plant", "balanced"])
 @pytest.mark.parametrize("weight", [None, "free"])
 @pytest.mark.parametrize("feedthrough", [False, True])

@@ -47,7 +47,7 @@ def record(samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(size=(samples, 2)), rng.normal(size=(samples, 1))
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_the_recursion_becomes_its_steady_state(name):
     design = designed(name)

@@ -191,6 +191,7 @@ MATCHING: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], int]] = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", MATCHING)
 def test_weights_and_reference_models_of_optimal_filters_are_proved(name: str) -> None:
     plant, options, count = MATCHING[name]

@@ -360,6 +360,7 @@ def test_units_do_not_decide_whether_there_is_an_observer() -> None:
     np.testing.assert_array_equal(kept["Q"], design.options["Q"])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_parameter_may_be_read_where_no_state_is(seed: int) -> None:
     # Its regressor is exactly zero: the least-squares problem leaves the rounding of that sensor's own datum.

@@ -29,6 +29,7 @@ def plants(seed: int) -> tuple[obsynth.DescriptorSystem, obsynth.DescriptorSyste
     return explicit, descriptor
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("method", METHODS)
 def test_a_design_is_that_of_the_explicit_form(method: str, seed: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,10 +35,15 @@ PLANTS = {
 }
 
 
+@cache
+def plant_and_filter(name: str) -> tuple[obsynth.DescriptorSystem, obsynth.ObserverDesign]:
+    plant = obsynth.DescriptorSystem(**PLANTS[name])
+    return plant, obsynth.optimal_filter(plant)
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
-    plant = obsynth.DescriptorSystem(**PLANTS[name])
-    design = obsynth.optimal_filter(plant)
+    plant, design = plant_and_filter(name)
     assert design.report.passed
     assert "does not decay, and no noise drives it" in design.notes[-1]
     poles = np.linalg.eigvals(design.observer.Az)
@@ -46,8 +52,7 @@ def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["a constant", "a constant beside a noisy state", "an oscillation"])
 def test_its_gain_is_the_limit_of_plants_whose_mode_is_driven_less_and_less(name: str) -> None:
-    plant = obsynth.DescriptorSystem(**PLANTS[name])
-    design = obsynth.optimal_filter(plant)
+    plant, design = plant_and_filter(name)
     lasting = plant.nx - 1
     driven = plant.replace(
         Bw=np.hstack([plant.Bw, 1e-4 * np.eye(plant.nx)[:, :lasting]]),
@@ -60,8 +65,7 @@ def test_its_gain_is_the_limit_of_plants_whose_mode_is_driven_less_and_less(name
 
 
 def test_a_run_from_an_offset_forgets_it() -> None:
-    plant = obsynth.DescriptorSystem(**PLANTS["a constant"])
-    design = obsynth.optimal_filter(plant)
+    plant, design = plant_and_filter("a constant")
     y = np.tile(plant.C @ [1.0, 0.0], (2000, 1))
     faults = design.observer.run(y).faults
     assert np.max(np.abs(faults[:5])) > 1e-2

@@ -29,6 +29,7 @@ def filter_of(size: float | None, *, mixed: bool = False) -> obsynth.ObserverDes
     return obsynth.fault_estimation_filter(plant_with(size, mixed=mixed))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("units", SENSORS)
 def test_a_measured_disturbance_costs_nothing_any_more(units: str, mixed: bool) -> None:

@@ -35,6 +35,7 @@ def with_second_sensor(name: str) -> obsynth.DescriptorSystem:
     )  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", SILENT)
 def test_a_sensor_that_says_nothing_of_the_states_takes_no_design_away(name: str, method: str) -> None:
@@ -100,6 +101,7 @@ def test_a_copy_in_another_unit_takes_no_fault_filter_away(seed: int, ratio: flo
     assert both.certificate.claims["gamma"] <= 1.001 * one.certificate.claims["gamma"]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("difference", [1e-12, 1e-8, 1e-4])
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_copy_but_for_its_last_digits_costs_no_noise_and_no_gain(parallel: bool, difference: float) -> None:

@@ -69,6 +69,7 @@ def test_a_nonlinear_region_is_left_to_a_design() -> None:
     assert "decided by a design" in lines["region-observer"]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_state_that_an_output_alone_determines_is_no_matter_of_rounding(seed: int) -> None:
     # One output, one unknown input that it shows: the innovation is nothing but rounding, and the filter is verified.

@@ -20,6 +20,7 @@ def plant_with(factors: list[float], dt: float, *, direction: tuple[float, float
     )  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 @pytest.mark.parametrize("factor", [3.0, 0.1, 1.0 / 3.0, 7e5])
 @pytest.mark.parametrize("method", ["ui-pi-observer", "functional-filter"])

@@ -567,7 +567,7 @@ def test_recursive_designs_live_on_over_flaws(flaw: str) -> None:
     assert run.outliers == ({"b": 1} if flaw == "outlier" else {})
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(9)
 @pytest.mark.parametrize("flaw", MORE_FLAWS)
 @pytest.mark.parametrize("kind", ["linear", "recursive"])
 def test_thresholds_are_learned_over_flaws(flaw: str, kind: str) -> None:

@@ -131,7 +131,7 @@ AT_THE_LIMIT = {hardly_visible_fault: (DROWNED,)}
 @pytest.mark.parametrize("structure", STRUCTURES, ids=lambda structure: structure.__name__)
 def test_a_filter_is_found_and_proved(structure, share):
     failures = []
-    for seed in share(range(STRUCTURES[structure]), 2):
+    for seed in share(range(STRUCTURES[structure]), 4):
         plant = obsynth.DescriptorSystem(**structure(np.random.default_rng([49, seed])), dt=0.1)
         try:
             passed = obsynth.fault_estimation_filter(plant).report.passed

@@ -58,6 +58,7 @@ def test_placed_poles_have_no_more_noise_with_a_sensor_more(seed, kind):
     assert np.isclose(noise_of(more), expected, rtol=1e-2 if kind == "nearly equal" else 1e-3)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", MORE)
 @pytest.mark.parametrize("method", ["ui-pi-observer", "pd-observer", "functional-filter"])
 def test_no_method_is_slower_or_noisier_for_a_sensor_more(method, kind):

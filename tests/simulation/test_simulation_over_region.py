@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
-from tests.support.polytopic_plants import record, wang
+from tests.support.polytopic_plants import record, wang, wang_filter
 
 import obsynth
 from obsynth import PolytopicSystem, PreconditionError, Scenario, SpecError
@@ -78,7 +78,7 @@ def test_a_continuous_plant_agrees_with_an_integrator() -> None:
 
 
 def test_a_scheduled_design_finds_the_fault_while_its_parameters_move() -> None:
-    design = obsynth.fault_estimation_filter(wang())
+    design = wang_filter()
     scenario = Scenario(
         horizon=150,
         faults={"f2": obsynth.Step(size=2.0, start=80)},
@@ -134,7 +134,7 @@ def test_the_observer_of_a_nonlinear_plant_runs_on_a_scenario() -> None:
     ],
 )
 def test_what_a_scenario_over_a_region_does_not_have(changes: dict[str, object], told: str) -> None:
-    design = obsynth.fault_estimation_filter(wang())
+    design = wang_filter()
     with pytest.raises(SpecError, match=told):
         obsynth.simulate(design, Scenario(horizon=20, **changes))
 

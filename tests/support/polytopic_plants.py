@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
-from obsynth import PolytopicSystem
+import obsynth
+from obsynth import ObserverDesign, PolytopicSystem
 from obsynth.numerics.arrays import FloatArray
 
 #: Wang et al. 2015, example: E, A, C, Bf, Bd.
@@ -30,6 +33,12 @@ def wang(spread: float = 0.05, *, effectiveness: bool = False, rate: float | Non
         scheduling["c"] = [-1.0, 1.0]
     plant = {"E": WANG_E, "A": A, "B": [[1], [0], [0], [0]], "C": WANG_C, "Bf": Bf, "Bd": WANG_BD, "dt": 1.0}
     return PolytopicSystem(plant=plant, scheduling=scheduling)
+
+
+@cache
+def wang_filter(*, effectiveness: bool = False) -> ObserverDesign:
+    """Return the fault estimation filter of the example, which many tests look at."""
+    return obsynth.fault_estimation_filter(wang(effectiveness=effectiveness))
 
 
 def record(

@@ -146,7 +146,7 @@ def test_the_good_design_passes() -> None:
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", TABLE)
 def test_a_corrupted_design_fails(name: str, monkeypatch) -> None:
     corrupt, expected = TABLE[name]
