@@ -157,3 +157,15 @@ def test_a_fast_state_that_nothing_shows_does_not_hurry_a_default(method):
     if method == "optimal-filter":
         assert more.certificate.claims["gain"] == pytest.approx(own.certificate.claims["gain"], rel=1e-3)
     assert noise_of(more) <= 4.0 * noise_of(own)
+
+
+def test_a_sensor_that_shows_a_fault_at_once_by_a_small_difference_makes_no_filter_noisier():
+    a = [[0.2, 0.6, 0.2, 0.2], [-1.2, 0.2, -0.4, 0.0], [0.0, 0.0, -0.2, -0.2], [0.8, 0.2, 0.4, 0.6]]
+    rows = [[0.0, 0.0, 0.0, 1.0], [-0.000452, -0.001303, -0.002231, 0.999008]]
+    noise = []
+    for count in (1, 2):
+        plant = obsynth.DescriptorSystem(
+            A=a, C=rows[:count], Bf=[[1.0], [0.0], [0.5], [0.0]], Dw=0.1 * np.eye(count), dt=1.0
+        )
+        noise.append(noise_of(obsynth.fault_estimation_filter(plant)))
+    assert noise[1] <= 1.001 * noise[0]

@@ -53,7 +53,12 @@ from obsynth.observers.linear.means import averaged, unaveraged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
+from obsynth.plants.transformations.redundant_outputs import (
+    MergedOutputs,
+    merged_outputs,
+    nearly_merged_outputs,
+    picked_outputs,
+)
 from obsynth.results.design import Certificate
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES, OUTPUTS_READ, least_gain_row
 
@@ -117,17 +122,22 @@ def _less_noisy(
     method: FaultEstimationFilter,
     progress: Callable[[str], None],
 ) -> Synthesis:
-    """Return the filter with nearly dependent outputs merged where that exists and is less noisy, else the other.
+    """Return the filter with nearly dependent outputs merged, or of one of them where that does not exist, where it is
+    less noisy, else the other.
 
     A gain on disturbances that is less by more than the margin is worth noise, but not any: a difference between
     outputs that are equal but for the last digits of a linearisation decouples nothing of a real plant.
     """
-    conditions, prepared = examine_fault_filter(near.plant)
-    if prepared is None or not all(condition.holds for condition in conditions):
-        return made
-    try:
-        other = _of_merged(plant, near, _synthesised(near.plant, conditions, prepared, method, progress))
-    except ObsynthError:
+    for merged in (near, picked_outputs(plant, near)):
+        conditions, prepared = examine_fault_filter(merged.plant)
+        if prepared is None or not all(condition.holds for condition in conditions):
+            continue
+        try:
+            other = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, method, progress))
+        except ObsynthError:
+            continue
+        break
+    else:
         return made
     if not _is_as_labelled(other):
         # A W that is the paper's of the merged outputs is another left inverse for those as given.

@@ -99,6 +99,15 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     return MergedOutputs(plant.replace(**merged, output_names=names), read_only(weights), False)
 
 
+def picked_outputs(plant: DescriptorSystem, merged: MergedOutputs) -> MergedOutputs:
+    """Return the plant with the sensors alone that give merged outputs their names: a mean of sensors that differ a
+    little may show at once, by that difference, what each of them shows a sample later."""
+    picked = [plant.output_names.index(name) for name in merged.plant.output_names]
+    rows = {name: getattr(plant, name)[picked] for name in ("C", "D", "Df", "Dd", "Dw")}
+    alone = plant.replace(**rows, output_names=merged.plant.output_names)
+    return MergedOutputs(alone, read_only(np.eye(plant.ny)[picked]), merged.exact)
+
+
 def _independent(output_rows: FloatArray) -> tuple[list[int], FloatArray, bool]:
     """Return independent rows, the first ones where the numbers as written say which; Q: all rows from these; whether
     the numbers as written have this rank.  Rows that differ by rounding (a copy in another unit) depend on each
