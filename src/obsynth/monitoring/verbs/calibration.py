@@ -108,6 +108,11 @@ def run_calibrate(options: argparse.Namespace) -> int:
         if log is None:
             raise SpecError("There is no log: give --data, or calibrate.log in the spec.", path="calibrate.log")
         protect(log)
+        if options.out is not None and options.out.suffix.lower() in (".yaml", ".yml"):
+            raise SpecError(
+                f"--out is for the calibration itself (.json): --write-spec {options.out} writes the calibrated spec.",
+                path=str(options.out),
+            )
         target = None if options.out is None else output_file(options.out, CALIBRATION, options)
         written = None if options.write_spec is None else output_file(options.write_spec, CALIBRATED_SPEC, options)
         if written is not None and written.resolve().parent != options.system.resolve().parent:
