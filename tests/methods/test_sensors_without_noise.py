@@ -121,6 +121,15 @@ def test_sensors_without_noise_that_follow_from_others_change_nothing(seed: int)
     assert np.max(np.abs(design.observer.By), initial=0.0) < 1e3
 
 
+def test_noise_that_is_read_by_rounding_only_has_its_own_mean_square() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.0]], Bf=[[2.0]], Bw=[[0.0]], C=[[-1.0], [0.5], [-0.5]], Dw=[[0.0], [-0.5], [0.0]], dt=0.0
+    )
+    claims = obsynth.optimal_filter(plant, norm="h2", reference={"bandwidth": 1.0, "order": 2}).certificate.claims
+    assert claims["least_deviation"] == 0.0
+    assert claims["deviation"] < 1e-9
+
+
 def test_outputs_that_show_derivatives_of_white_noise_have_no_filter_of_least_mean_square() -> None:
     plant = obsynth.DescriptorSystem(
         E=np.diag([1.0, 0.0]),

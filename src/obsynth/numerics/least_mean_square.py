@@ -9,10 +9,11 @@ What takes more of them is approached, by filters for a little noise on the outp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -93,6 +94,15 @@ class _Measured:
         closed, driven = self.a - gain @ self.c, self.b - gain @ self.d
         spread = continuous_lyapunov(closed, -driven @ driven.T) if len(closed) else np.zeros_like(closed)
         return float(np.sqrt(max(np.trace(wanted @ spread @ wanted.T), 0.0)))
+
+    def shows(self) -> NDArray[np.bool_]:
+        """Return which outputs show more than rounding."""
+        own = np.linalg.norm(self.d, axis=1) + np.linalg.norm(self.c, axis=1) * self.reach
+        return np.asarray(own > WINDOW_RANK_TOLERANCE * self.units)
+
+    def of_rows(self, rows: NDArray[np.bool_]) -> _Measured:
+        """Return the same with some of its outputs."""
+        return replace(self, c=self.c[rows], d=self.d[rows], units=self.units[rows])
 
     def with_noise(self, share: float) -> _Measured:
         """Return the same with noise of its own on every output: a share of what the states' noise does to it."""
@@ -176,7 +186,7 @@ def _of_the_rest(
     error_rows = rows - Z0 @ c
     least = _least(split.rest, error_rows @ N)
     if added:
-        K, noise = split.rest.with_noise(added).gain(), added
+        K, noise = _gain_with_noise(split.rest, added), added
     else:
         K, noise = _gain_near_the_least(split.rest, error_rows @ N, least)
     K1, K2 = K[:, : len(split.noisy)], K[:, len(split.noisy) :]
@@ -194,15 +204,32 @@ def _of_the_rest(
 
 def _gain_near_the_least(rest: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
     """Return the gain of least mean square, or one for added noise that comes near to it, and that noise."""
-    if not len(rest.c) or _split(rest) is None:
-        return rest.gain(), 0.0
+    shows = rest.shows()
+    live = rest.of_rows(shows)
+    gain, noise = np.zeros((len(rest.a), len(rest.c))), 0.0
+    if _split(live) is None:
+        gain[:, shows] = live.gain()
+    else:
+        gain[:, shows], noise = _noisy_gain(live, wanted, least)
+    return gain, noise
+
+
+def _gain_with_noise(measured: _Measured, share: float) -> FloatArray:
+    shows = measured.shows()
+    gain = np.zeros((len(measured.a), len(measured.c)))
+    gain[:, shows] = measured.of_rows(shows).with_noise(share).gain()
+    return gain
+
+
+def _noisy_gain(measured: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
+    """Return the gain for the most added noise that comes near to the least mean square, and that noise."""
     enough, best = NEAR_THE_LEAST * least, None
     for share in ADDED_NOISES:
         try:
-            gain = rest.with_noise(share).gain()
+            gain = measured.with_noise(share).gain()
         except PreconditionError:
             continue
-        deviation = rest.deviation(gain, wanted)
+        deviation = measured.deviation(gain, wanted)
         if best is None:
             enough = max(enough, NEARLY_ZERO * deviation)
         if best is None or deviation < best[0]:
@@ -216,9 +243,10 @@ def _gain_near_the_least(rest: _Measured, wanted: FloatArray, least: float) -> t
 
 def _least(measured: _Measured, wanted: FloatArray) -> float:
     """Return the least mean square, its root, of any filter: without states that outputs and derivatives show."""
-    while (split := _split(measured)) is not None:
+    while (split := _split(measured.of_rows(measured.shows()))) is not None:
         measured, wanted = split.rest, wanted @ split.N
-    return float(np.sqrt(max(np.trace(wanted @ measured.covariance() @ wanted.T), 0.0)))
+    covariance = measured.of_rows(measured.shows()).covariance()
+    return float(np.sqrt(max(np.trace(wanted @ covariance @ wanted.T), 0.0)))
 
 
 def _split(measured: _Measured) -> _Split | None:

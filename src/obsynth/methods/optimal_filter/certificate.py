@@ -105,6 +105,9 @@ def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str,
     own, gain = channel.deviation(dt), 0.0 if chosen.is_nothing else chosen.gain
     if ZERO_GAIN * channel.size < own <= channel.rounding and abs(own - gain) > ROUNDING_OF_DEVIATIONS * gain:
         return {"deviation": float(10.0 ** np.ceil(np.log10(2.0 * own))), "least_deviation": 0.0}
+    if chosen.is_nothing and ZERO_GAIN * channel.size < own <= chosen.nothing:
+        # Noise that the filter reads by rounding only: small beside what it estimates, not beside what it reads.
+        return {"deviation": own, "least_deviation": 0.0}
     least = gain if chosen.is_nothing or chosen.least is None else chosen.least
     return {"deviation": max(gain, own) if gain and own <= channel.rounding else gain, "least_deviation": least}
 

@@ -79,7 +79,7 @@ def _filter(
     filter_, size = fraction
     filter_ = filter_ if plant.is_discrete else uncayley(*filter_, chosen.problem.alpha)
     own = filter_in_plant_units(plant, chosen.fault_map._replace(weights=None), filter_)
-    return chosen._replace(filter=own, least=chosen.gain), size
+    return chosen._replace(filter=own, least=chosen.least_gain), size
 
 
 def _shared(least: tuple[int, ...], limit: int) -> list[tuple[int, ...]]:
