@@ -326,7 +326,11 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: Shipped) -> None:
     design = shipped.design(WALKING)
     alone = told(design)
     statistics = replace(alone.statistics, estimates=())
-    alone = replace(alone, statistics=statistics, levels=alone.levels[: len(statistics.names)])
+    count = len(statistics.names)
+    assert alone.ranges is not None
+    assert alone.ranges.rates is not None
+    ranges = alone.ranges._replace(rates=alone.ranges.rates[:, :count])
+    alone = replace(alone, statistics=statistics, levels=alone.levels[:count], ranges=ranges)
     with_changes, without = (
         obsynth.run_on_data(
             design, log_of(design), monitor=obsynth.online_monitor(design, "learned", normal=one, sensor_faults=False)
