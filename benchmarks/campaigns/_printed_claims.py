@@ -20,6 +20,7 @@ from benchmarks.campaigns._written_plants import (
     effects,
     held,
     kernels,
+    outputs,
     sampled,
     worst_sum,
 )
@@ -62,12 +63,7 @@ def write_log(path: Path, plant: WrittenPlant, u: np.ndarray, y: np.ndarray) -> 
 def random_outputs(plant: WrittenPlant, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return outputs without a fault for white noise and disturbances that are drawn anew for each sample."""
     d = rng.uniform(-1.0, 1.0, (len(u), len(plant.bounds))) * plant.bounds
-    step, push = sampled(plant, np.hstack([plant.B, plant.Bd]))
-    x, y = np.zeros(len(plant.A)), rng.standard_normal((len(u), len(plant.C))) * plant.noise
-    for k in range(len(u)):
-        y[k] += plant.C @ x + plant.Dd @ d[k]
-        x = step @ x + push @ np.concatenate([u[k : k + 1], d[k]])
-    return y
+    return outputs(plant, u, np.zeros(len(u)), d) + rng.standard_normal((len(u), len(plant.C))) * plant.noise
 
 
 def separate(alarms: np.ndarray, apart: int) -> int:
@@ -121,14 +117,13 @@ def largest_statistic(design: ob.ObserverDesign, plant: WrittenPlant, samples: i
 
 def _responses(plant: WrittenPlant, design: ob.ObserverDesign, *, noise: bool) -> np.ndarray:
     """Return the response of the fault estimates to held disturbances and ``noise``, ``(frequencies, nf, inputs)``."""
-    observer, n = design.linear[1], len(plant.A)
-    step, push = sampled(plant, plant.Bd)
-    direct = plant.Dd
+    observer, model = design.linear[1], sampled(plant)
+    n, push, direct = len(model.A), model.Bd, model.Dd
     if noise:
         push, direct = np.hstack([push, np.zeros((n, len(plant.C)))]), np.hstack([direct, np.diag(plant.noise)])
     cz, dy = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
-    a = np.block([[step, np.zeros((n, observer.order))], [observer.By @ plant.C, observer.Az]])
-    b, c = np.vstack([push, observer.By @ direct]), np.hstack([dy @ plant.C, cz])
+    a = np.block([[model.A, np.zeros((n, observer.order))], [observer.By @ model.C, observer.Az]])
+    b, c = np.vstack([push, observer.By @ direct]), np.hstack([dy @ model.C, cz])
     points = np.concatenate([[0.0], np.geomspace(1e-5, np.pi, FREQUENCIES), np.linspace(0.0, np.pi, FREQUENCIES)])
     lhs = np.exp(1j * points)[:, None, None] * np.eye(len(a)) - a
     return np.asarray(c @ np.linalg.solve(lhs, np.broadcast_to(b, (len(points), *b.shape))) + dy @ direct)
@@ -153,11 +148,11 @@ def deviation(plant: WrittenPlant, design: ob.ObserverDesign) -> float:
 
 def detectable(plant: WrittenPlant) -> tuple[bool, bool]:
     """Return whether the fault is no combination of disturbances at the outputs: in general, and for constant ones."""
-    step, push = sampled(plant, np.hstack([plant.Bf, plant.Bd]))
-    direct = np.hstack([np.zeros((len(plant.C), 1)), plant.Dd])
+    model = sampled(plant)
+    push, direct = np.hstack([model.Bf, model.Bd]), np.hstack([model.Df, model.Dd])
 
     def more(z: complex) -> bool:
-        seen = plant.C @ np.linalg.solve(z * np.eye(len(step)) - step, push.astype(complex)) + direct
+        seen = model.C @ np.linalg.solve(z * np.eye(len(push)) - model.A, push.astype(complex)) + direct
         sizes = np.linalg.norm(seen, axis=0)
         seen = seen / np.where(sizes > 0.0, sizes, 1.0)
         ranks = [int(np.sum(np.linalg.svd(part, compute_uv=False) > RANK)) for part in (seen, seen[:, 1:])]
@@ -170,11 +165,11 @@ def missed_by_steps(plant: WrittenPlant, text: str) -> float:
     """Return what is left of steps and states that cancel, as a share of the sizes of the terms."""
     values = {name: float(value) for value, name in re.findall(r"a step of (\S+) in (\w+)", text)}
     values |= {name: float(value) for name, value in re.findall(r"(x\d) = ([-0-9.e]+[0-9])", text)}
-    names = plant.names
+    names, read = plant.names, plant.outputs
     x, f, d = (np.array([values.get(name, 0.0) for name in names[kind]]) for kind in "xfd")
     terms = np.block([
         [plant.A * x, plant.Bf * f, plant.Bd * d],
-        [plant.C * x, np.zeros((len(plant.C), 1)), plant.Dd * d],
+        [read["C"] * x, read["Df"] * f, read["Dd"] * d],
     ])  # fmt: skip
     return float(np.linalg.norm(terms.sum(axis=1)) / np.linalg.norm(np.abs(terms).sum(axis=1)))
 
@@ -184,13 +179,13 @@ def missed_by_steps(plant: WrittenPlant, text: str) -> float:
 
 def _of_window(plant: WrittenPlant, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return what a window of outputs ``(samples ny)`` shows of its first state and of a fault in each sample."""
-    step, push = sampled(plant, plant.Bf)
-    ny = len(plant.C)
-    states, faults = [plant.C], np.zeros((samples, ny, samples))
+    model, ny = sampled(plant), len(plant.C)
+    states, faults = [model.C], np.zeros((samples, ny, samples))
+    faults[np.arange(samples), :, np.arange(samples)] = model.Df[:, 0]
     for k in range(1, samples):
         for later in range(k, samples):
-            faults[later, :, later - k] = (states[k - 1] @ push)[:, 0]
-        states.append(states[-1] @ step)
+            faults[later, :, later - k] = (states[k - 1] @ model.Bf)[:, 0]
+        states.append(states[-1] @ model.A)
     return np.vstack(states), faults.reshape(samples * ny, samples)
 
 
@@ -239,7 +234,7 @@ def better_test(plant: WrittenPlant, design: ob.ObserverDesign, least: float, *,
     own = weights_of(design, LONGEST, row=0).ravel() @ faults
     at = LONGEST - 1 - design.linear[1].fault_delays[0]
     if abs(own[at] - 1.0) < ZERO and np.sum(np.abs(np.delete(own, at))) < ZERO:
-        wanted, values = np.hstack([states, faults]), np.concatenate([np.zeros(len(plant.A)), np.eye(LONGEST)[at]])
+        wanted, values = np.hstack([states, faults]), np.concatenate([np.zeros(states.shape[1]), np.eye(LONGEST)[at]])
         kept = np.any(wanted != 0.0, axis=0)
         wanted, values = wanted[:, kept], values[kept]
     else:
@@ -256,24 +251,23 @@ def filter_of_samples(plant: WrittenPlant, delay: int, *, noise: bool = False) -
     if delay >= TAPS:
         return None
     wanted = np.hstack([states, faults])
-    values = np.concatenate([np.zeros(len(plant.A)), np.eye(TAPS)[TAPS - 1 - delay]])
+    values = np.concatenate([np.zeros(states.shape[1]), np.eye(TAPS)[TAPS - 1 - delay]])
     first, *_ = np.linalg.lstsq(wanted.T, values, rcond=1e-12)
     size = float(np.max(np.abs(wanted).T @ np.abs(first)))
     if np.max(np.abs(wanted.T @ first - values)) > ZERO * max(1.0, size):
         return None
     free = null_space(wanted.T, rcond=1e-11)
-    step, push = sampled(plant, plant.Bd)
-    ny, nd = len(plant.C), len(plant.bounds)
+    model, ny, nd = sampled(plant), len(plant.C), len(plant.bounds)
     seen = np.zeros((TAPS, ny, TAPS, nd + ny * noise))
-    moved = push
+    moved = model.Bd
     for later in range(TAPS):
-        seen[later, :, later, :nd] = plant.Dd
+        seen[later, :, later, :nd] = model.Dd
         if noise:
             seen[later, :, later, nd:] = np.diag(plant.noise)
     for age in range(1, TAPS):
         for at in range(TAPS - age):
-            seen[at + age, :, at, :nd] = plant.C @ moved
-        moved = step @ moved
+            seen[at + age, :, at, :nd] = model.C @ moved
+        moved = model.A @ moved
     flat = seen.reshape(TAPS * ny, -1)
 
     def response(w: np.ndarray, points: np.ndarray) -> np.ndarray:

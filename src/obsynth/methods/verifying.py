@@ -12,6 +12,7 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, field_types, is_number, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
@@ -136,7 +137,7 @@ def _option_rows(method: type[Method], design: ObserverDesign) -> Iterator[Check
     fields = field_types(method).keys() - {"constraints", "objective"}
     stored = {name: value for name, value in design.options.items() if name in fields}
     try:
-        if isinstance(design.observer, LinearObserver):
+        if isinstance(design.observer, (LinearObserver, ScheduledObserver)):
             method.of(stored)
     except SpecError as error:
         reasons = [str(problem) for problem in error.problems] or [str(error)]

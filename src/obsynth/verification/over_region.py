@@ -7,7 +7,7 @@ vertex_inequalities`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,7 @@ from obsynth.proofs.vertex_inequalities import (
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.identities import equality, tracking_identities, worst
+from obsynth.verification.identities import Identity, equality, tracking_identities, worst
 
 #: Names of the rows.
 GAIN_ROW, DECAY_ROW, DECOUPLING_ROW = "LMI", "decay over the region", "fault decoupled for every scheduling"
@@ -135,6 +135,29 @@ def worst_of_vertices(reports: Iterable[Iterable[Check]], scheduling: Scheduling
         yield replace(
             row, claim=f"{row.claim}, at every vertex", detail=f"{row.detail}, at {scheduling.vertex_name(place)}"
         )
+
+
+def listed_gains_row(
+    gains: Mapping[str, FloatArray],
+    shapes: Mapping[str, tuple[int, ...]],
+    identities: Callable[[], Iterable[Identity]],
+) -> Iterator[Check]:
+    """Yield the row on the listed gains by their letters; nothing where none are listed, as the realisation stands for
+    itself."""
+    if not gains:
+        return
+    wrong = sorted(shapes.keys() ^ gains.keys())
+    wrong += [letter for letter, shape in shapes.items() if letter in gains and gains[letter].shape != shape]
+    claim = "the listed gains are those of the realisation and of the certificate, at every vertex"
+    if wrong:
+        yield nothing_wrong("gains", claim, wrong, source="gain set")
+        return
+    yield equality("gains", claim, worst([identity.residual() for identity in identities()]), "gain set")
+
+
+def by_vertex(letter: str, count: int) -> tuple[str, ...]:
+    """Return the names of a gain that each vertex has one of."""
+    return tuple(f"{letter}[{place + 1}]" for place in range(count))
 
 
 def fault_error_vertices(

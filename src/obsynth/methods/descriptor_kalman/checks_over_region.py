@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -19,15 +19,17 @@ from obsynth.proofs.vertex_inequalities import Vertex, pairs_of
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
-from obsynth.verification.identities import Residual, equality
+from obsynth.verification.identities import Identity, Residual, equality
 from obsynth.verification.over_region import (
     FROZEN_ROW,
     GAIN_WITNESSES,
     WITNESSES,
+    by_vertex,
     courses,
     decay_row,
     deviation_row,
     forgetting_row,
+    listed_gains_row,
     same_scheduling_row,
     scheduled_pair,
     share_signals,
@@ -71,6 +73,9 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     observers = [observer.at_vertex(place) for place in range(plant.count)]
     yield from tracking_rows(vertex_errors(plant, observers, tracking), plant.scheduling, _IDENTITIES)
     yield _unknown_input_row(plant, tracking)
+    n, ny = plant.nx, plant.ny
+    shapes = {"L": (n, n), "K": (n, ny)} | dict.fromkeys(by_vertex("S", plant.count), (n, ny))
+    yield from listed_gains_row(design.gains, shapes, lambda: _of_gains(design.gains, plant, observer, tracking))
     yield from _proved_rows(design, plant, observer, tracking, noise)
 
 
@@ -92,6 +97,20 @@ def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatAr
         and tracking.shape == (plant.nx, plant.nx)
         and np.isfinite(tracking).all()
     )
+
+
+def _of_gains(
+    gains: Mapping[str, FloatArray], plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray
+) -> Iterator[Identity]:
+    """Yield what makes the realisation that of the listed gains: ``Az = L A - S C, By = L A K + S (I - C K)``."""
+    L, K = gains["L"], gains["K"]
+    yield Identity((L, -tracking), entrywise=True)
+    yield Identity((K, -observer.Dy[observer.state_rows]), entrywise=True)
+    each = zip(by_vertex("S", plant.count), plant.vertices, observer.Az, observer.By, strict=True)
+    for letter, vertex, Az, By in each:
+        S, A, C = gains[letter], vertex.A, vertex.C
+        yield Identity((Az, -L @ A, S @ C), ((L, A), (S, C)))
+        yield Identity((By, -L @ A @ K, -S, S @ C @ K), ((L, A, K), (S, C, K)))
 
 
 def _unknown_input_row(plant: PolytopicSystem, tracking: FloatArray) -> Check:

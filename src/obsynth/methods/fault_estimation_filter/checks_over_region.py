@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
-from obsynth.analysis.existence.over_region import conditions_over_region
+from obsynth.analysis.existence.over_region import FilterOverRegion, examine_over_region
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.identities_over_region import (
     IDENTITIES,
@@ -12,8 +12,10 @@ from obsynth.methods.fault_estimation_filter.identities_over_region import (
     gain_rows,
     have_matching_signals,
 )
+from obsynth.methods.fault_estimation_filter.printed_gains import gain_rows as gain_rows_of_vertex
+from obsynth.methods.fault_estimation_filter.printed_gains import gains_fit
 from obsynth.methods.fault_estimation_filter.turning_checks import turning_checks
-from obsynth.methods.fault_estimation_filter.whole_transfer import fault_rows
+from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.numerics.scaling import Scaling
@@ -29,10 +31,12 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.over_region import (
     DECOUPLING_ROW,
     WITNESSES,
+    by_vertex,
     courses,
     decay_row,
     fault_error_vertices,
     forgetting_row,
+    listed_gains_row,
     same_scheduling_row,
     scheduled_pair,
     tracking_rows,
@@ -43,6 +47,9 @@ from obsynth.verification.over_region import (
 )
 from obsynth.verification.plant import condition_rows
 
+#: Letters of gains that all vertices share.
+_SAME_EVERYWHERE = ("T", "N", "W", "Psi", "Upsilon")
+
 
 def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     """Yield every check of a filter over a region; see `obsynth.verify`."""
@@ -51,7 +58,8 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
         yield wrong_kinds_row()
         return
     plant, observer = pair
-    yield from condition_rows(conditions_over_region(plant))
+    conditions, parts = examine_over_region(plant)
+    yield from condition_rows(conditions)
     if observer.correction is not None:
         yield from turning_checks(design, plant, observer)
         return
@@ -59,6 +67,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     fits = (
         tracking is not None
         and have_matching_signals(plant, observer, tracking)
+        and claimed(design.certificate.claims, "state_lag") == 0.0
         and observer.residual_names == plant.fault_names
     )
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
@@ -72,6 +81,8 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     models = vertex_errors(plant, observers, tracking)
     yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, observers, tracking, models)
+    if isinstance(parts, FilterOverRegion):
+        yield from _gain_rows(design.gains, plant, observer, tracking, parts)
     yield from _proved_rows(design, plant, observer, tracking)
 
 
@@ -99,6 +110,31 @@ def _fault_rows(
             )
         else:
             yield row
+
+
+def _gain_rows(
+    gains: Mapping[str, FloatArray],
+    plant: PolytopicSystem,
+    observer: ScheduledObserver,
+    tracking: FloatArray,
+    parts: FilterOverRegion,
+) -> Iterator[Check]:
+    """Yield the rows on the listed gains, of which L is that of a vertex, as a filter of constant matrices has them."""
+    own = by_vertex("L", plant.count)
+    if not gains or gains.keys() != {*_SAME_EVERYWHERE, *own}:
+        yield from listed_gains_row(gains, dict.fromkeys((*_SAME_EVERYWHERE, *own), ()), tuple)
+        return
+    reports = []
+    for place, (letter, vertex, work) in enumerate(zip(own, parts.vertices, parts.work, strict=True)):
+        undivided, listed = observer.before_division(place), {name: gains[name] for name in _SAME_EVERYWHERE}
+        listed["L"] = gains[letter]
+        rows = [gains_fit(work, listed, undivided)]
+        scaling = _scaling(work)
+        if rows[0].passed and scaling is not None:
+            equations = Equations.of(vertex, work, undivided.fault_delays)
+            rows += gain_rows_of_vertex(work, listed, undivided, tracking, equations, scaling, {})
+        reports.append(rows)
+    yield from worst_of_vertices(reports, plant.scheduling)
 
 
 def _scaling(plant: DescriptorSystem) -> Scaling | None:

@@ -8,7 +8,7 @@ mean, with weights ``mu_i^2`` and ``2 mu_i mu_j``, of what it is at pairs of ver
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -30,9 +30,11 @@ from obsynth.verification.claims import claimed
 from obsynth.verification.identities import Identity, equality, worst
 from obsynth.verification.over_region import (
     DECOUPLING_ROW,
+    by_vertex,
     courses,
     decay_row,
     forgetting_row,
+    listed_gains_row,
     same_scheduling_row,
     tracking_rows,
     vertex_errors,
@@ -45,7 +47,8 @@ _SOURCE = "a correction that turns with the faults"
 def turning_checks(design: ObserverDesign, plant: PolytopicSystem, observer: ScheduledObserver) -> Iterator[Check]:
     """Yield every check after the conditions of existence."""
     tracking, K = design.certificate.matrices.get("tracking"), observer.correction
-    fits = tracking is not None and K is not None and _fits(plant, observer, tracking)
+    lag = claimed(design.certificate.claims, "state_lag")
+    fits = tracking is not None and K is not None and lag == 0.0 and _fits(plant, observer, tracking)
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
     if tracking is None or K is None or not fits:
         return
@@ -57,6 +60,9 @@ def turning_checks(design: ObserverDesign, plant: PolytopicSystem, observer: Sch
     models = vertex_errors(plant, undivided, tracking)
     yield from tracking_rows(models, plant.scheduling, IDENTITIES)
     yield from _fault_rows(plant, observer, tracking, K)
+    n, ny = plant.nx, plant.ny
+    shapes = {"T": (n, n), "N": (n, ny), "W": (plant.nf, ny)} | dict.fromkeys(by_vertex("K", plant.count), (n, ny))
+    yield from listed_gains_row(design.gains, shapes, lambda: _of_gains(design.gains, plant, observer, tracking, K))
     yield from _proved_rows(design, plant, observer, tracking, K)
 
 
@@ -94,6 +100,23 @@ def _fault_rows(
         for own, effect, vertex in zip(driven, observer.effectiveness, plant.vertices, strict=True)
     ]
     yield equality("fault estimate", "fhat(k) = f(k - 1): W C T Bf is the effectiveness", worst(each), _SOURCE)
+
+
+def _of_gains(
+    gains: Mapping[str, FloatArray],
+    plant: PolytopicSystem,
+    observer: ScheduledObserver,
+    tracking: FloatArray,
+    K: FloatArray,
+) -> Iterator[Identity]:
+    """Yield what makes the realisation that of the listed gains."""
+    N, W, C, rows = gains["N"], gains["W"], plant.vertices[0].C, observer.fault_rows
+    yield Identity((gains["T"], -tracking), entrywise=True)
+    yield Identity((N, -observer.Dy[observer.state_rows]), entrywise=True)
+    yield Identity((observer.Cz[rows], W @ C), ((W, C),))
+    yield Identity((observer.Dy[rows], -W, W @ C @ N), ((W, C, N),))
+    for letter, own in zip(by_vertex("K", plant.count), K, strict=True):
+        yield Identity((gains[letter], -own), entrywise=True)
 
 
 def _proved_rows(

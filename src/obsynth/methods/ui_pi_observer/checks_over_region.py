@@ -9,6 +9,7 @@ import numpy as np
 from obsynth.analysis.existence.augmented_pencils import shipped_model
 from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_over_region
 from obsynth.methods.ui_pi_observer.identities import identities
+from obsynth.methods.ui_pi_observer.number_checks import gain_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.faults import Exosystem
@@ -24,9 +25,11 @@ from obsynth.verification.over_region import (
     GAIN_WITNESSES,
     REGION_GAIN_ROW,
     WITNESSES,
+    by_vertex,
     courses,
     decay_row,
     forgetting_row,
+    listed_gains_row,
     rated_gain_row,
     region_gain_row,
     same_scheduling_row,
@@ -34,9 +37,13 @@ from obsynth.verification.over_region import (
     share_signals,
     switching_row,
     witness_of_certificate,
+    worst_of_vertices,
     wrong_kinds_row,
 )
 from obsynth.verification.plant import condition_rows
+
+#: Letters of gains that all vertices share.
+_SAME_EVERYWHERE = ("U_a", "D_a", "Phi", "Cw")
 
 _MATRICES = ("tracking", "Phi", "Cw")
 
@@ -61,6 +68,7 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     if not same.passed:
         return
     yield from _identity_rows(plant, observer, matrices["tracking"], model)
+    yield from _gain_rows(design.gains, plant, observer, matrices["tracking"], model)
     yield from _proved_rows(design, plant, observer)
 
 
@@ -99,6 +107,30 @@ def _identity_rows(
             row.name, row.claim, row.value, row.bound, row.margin, row.passed, row.source, row.kind,
             f"{row.detail}, at {plant.scheduling.vertex_name(place)}",
         )  # fmt: skip
+
+
+def _gain_rows(
+    gains: Mapping[str, FloatArray],
+    plant: PolytopicSystem,
+    observer: ScheduledObserver,
+    tracking: FloatArray,
+    model: Exosystem,
+) -> Iterator[Check]:
+    """Yield the row on the listed gains, of which K_a is that of a vertex."""
+    own = by_vertex("K_a", plant.count)
+    if not gains or gains.keys() != {*_SAME_EVERYWHERE, *own}:
+        yield from listed_gains_row(gains, dict.fromkeys((*_SAME_EVERYWHERE, *own), ()), tuple)
+        return
+    same = {letter: gains[letter] for letter in _SAME_EVERYWHERE}
+    yield from worst_of_vertices(
+        (
+            gain_rows(
+                {**same, "K_a": gains[letter]}, vertex, observer.at_vertex(place), model, tracking, EQUALITY_TOLERANCE
+            )
+            for place, (letter, vertex) in enumerate(zip(own, plant.vertices, strict=True))
+        ),
+        plant.scheduling,
+    )
 
 
 def _vertices(observer: ScheduledObserver, tracking: FloatArray, nx: int) -> list[Vertex]:
