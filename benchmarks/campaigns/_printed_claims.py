@@ -102,13 +102,17 @@ def _weights(observer: Any, of_state: np.ndarray, direct: np.ndarray, samples: i
     return found
 
 
-def largest_statistic(design: ob.ObserverDesign, plant: WrittenPlant, samples: int, rng: np.random.Generator) -> float:
-    """Return the largest norm of the residual that moving disturbances reach without a fault, of some directions."""
+def largest_statistic(
+    design: ob.ObserverDesign, plant: WrittenPlant, samples: int, rng: np.random.Generator, *, is_held: bool
+) -> float:
+    """Return the largest norm of the residual that disturbances, moving or held, reach without a fault, of some
+    directions."""
     observer, kernel, found = design.linear[1], kernels(plant, samples), 0.0
     rows = observer.residual_rows if observer.residual_names else observer.fault_rows
     for _ in range(1 if len(observer.Cz[rows]) == 1 else 4):
         each = _in_direction(observer, rows, samples, rng)
-        found = max(found, worst_sum(effects(kernel, each), each, plant.noise))
+        effect = effects(kernel, each)
+        found = max(found, worst_sum(held(effect) if is_held else effect, each, plant.noise))
     return found
 
 

@@ -140,15 +140,13 @@ def written_plant(rng: np.random.Generator, *, uncertain: bool) -> WrittenPlant:
 
 
 def of_another_form(plant: WrittenPlant, rng: np.random.Generator) -> WrittenPlant:
-    """Return the plant as it is, with delays, or with outputs that read a derivative (index 2)."""
-    kind, ny = rng.choice(["plain", "plain", "late", "derivative"]), len(plant.C)
-    if kind == "late":
+    """Return the plant with delays, or with outputs that read a derivative (index 2)."""
+    ny = len(plant.C)
+    if rng.random() < 0.5:
         late = rng.choice([0, 0, 3, PARTS_OF_DELAYS, 13, 2 * PARTS_OF_DELAYS], 1 + ny)
         return plant._replace(late=tuple(late.tolist()))
-    if kind == "derivative":
-        reads = (rng.random((ny, 1)) < 0.6) * rng.standard_normal((ny, 1))
-        return plant._replace(G=rng.standard_normal((1, len(plant.A))), reads=reads)
-    return plant
+    reads = (rng.random((ny, 1)) < 0.6) * rng.standard_normal((ny, 1))
+    return plant._replace(G=rng.standard_normal((1, len(plant.A))), reads=reads)
 
 
 def moved(plant: WrittenPlant, moving: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:

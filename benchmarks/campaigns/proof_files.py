@@ -34,12 +34,12 @@ NEEDED = {"guaranteed-test": {"threshold", "least"}}
 
 def random_plant(rng: np.random.Generator, method: str) -> obsynth.DescriptorSystem:
     """Return a plant that the method may have an observer for."""
-    nx = int(rng.integers(2, 9))
+    nx = int(rng.integers(2, 9 if method != "optimal-filter" else 5))
     nf = int(rng.integers(1, 3)) if nx > 2 else 1
     nd = int(rng.integers(0, 2))
     ny = min(nx, nf + nd + int(rng.integers(0, 2)))
     continuous = method in ("pd-observer", "detection-filter") or (
-        method in ("ui-pi-observer", "functional-filter") and rng.random() < 0.5
+        method in ("ui-pi-observer", "functional-filter", "optimal-filter") and rng.random() < 0.5
     )
     a = rng.standard_normal((nx, nx))
     a *= float(rng.uniform(0.3, 1.1)) / max(np.abs(np.linalg.eigvals(a)).max(), 1e-3)
@@ -52,7 +52,9 @@ def random_plant(rng: np.random.Generator, method: str) -> obsynth.DescriptorSys
     bf = rng.standard_normal((nx, nf))
     bd = rng.uniform(0.1, 1.0) * rng.standard_normal((nx, nd))
     c = rng.standard_normal((ny, nx))
-    noisy = method == "detection-filter" or (rng.random() < 0.7 and method in ("functional-filter", "ui-pi-observer"))
+    noisy = method in ("detection-filter", "optimal-filter") or (
+        rng.random() < 0.7 and method in ("functional-filter", "ui-pi-observer")
+    )
     inner, outer = np.hstack([0.1 * np.eye(nx), np.zeros((nx, ny))]), np.hstack([np.zeros((ny, nx)), 0.3 * np.eye(ny)])
     return obsynth.DescriptorSystem(
         e, a, rng.standard_normal((nx, 1)), c, Bf=bf, Bd=bd, Bw=inner if noisy else None, Dw=outer if noisy else None,
@@ -62,6 +64,8 @@ def random_plant(rng: np.random.Generator, method: str) -> obsynth.DescriptorSys
 
 def options_of(rng: np.random.Generator, method: str, plant: obsynth.DescriptorSystem) -> dict[str, Any]:
     """Return options for the method."""
+    if method == "optimal-filter":
+        return _of_optimal_filter(rng, plant)
     if method != "guaranteed-test":
         return {}
     return {
@@ -77,10 +81,34 @@ def options_of(rng: np.random.Generator, method: str, plant: obsynth.DescriptorS
     }
 
 
+def _of_optimal_filter(rng: np.random.Generator, plant: obsynth.DescriptorSystem) -> dict[str, Any]:
+    def model() -> dict[str, Any]:
+        pole = 0.4 if plant.dt else -1.0
+        return {"A": [[pole]], "B": [[1.0]], "C": [[float(rng.uniform(0.1, 0.4))]], "D": [[1.0]]}
+
+    options: dict[str, Any] = {}
+    if rng.random() < 0.4:
+        options["reference"] = {"bandwidth": float(rng.uniform(0.3, 3.0)), "order": int(rng.integers(1, 3))}
+        options["exact"] = bool(rng.random() < 0.5)
+    elif plant.dt:
+        options["delay"] = int(rng.integers(1, 3))
+    if rng.random() < 0.6:
+        weights = {"errors": {"f1": model() if rng.random() < 0.5 else 2.0}}
+        if rng.random() < 0.7:
+            weights["inputs"] = {plant.noise_names[0]: model() if rng.random() < 0.5 else 0.5}
+        options["weights"] = weights
+    if plant.nd and rng.random() < 0.3:
+        options["decoupled"] = plant.disturbance_names[0]
+    return options
+
+
 def case(seed: int) -> Outcome:
     """Design, export, check; change and check again."""
-    rng = np.random.default_rng([46, seed])
-    method = METHODS[seed % len(METHODS)]
+    return case_of(METHODS[seed % len(METHODS)], np.random.default_rng([46, seed]))
+
+
+def case_of(method: str, rng: np.random.Generator) -> Outcome:
+    """Draw a plant for a method; design, export, check; change and check again."""
     plant = random_plant(rng, method)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -139,6 +139,16 @@ def test_statements_say_what_is_assumed_of_disturbances() -> None:
     assert "held between samples" in jump.report["threshold"].claim
 
 
+def test_a_test_of_a_plant_with_delays_says_that_disturbances_are_held() -> None:
+    """Of its samples nothing is known in between: a disturbance that moves there would pass the threshold."""
+    plant, dt = plant_of(1)
+    late = obsynth.discretise(plant.replace(delays={"y1": 1.5 * dt}), dt)
+    for kind in ("any", "jump"):
+        design = obsynth.guaranteed_test(late, **ASKED, disturbance=kind)
+        assert "disturbances that are held between samples" in obsynth.online_monitor(design).statement
+        assert "disturbances that are held between samples" in design.report["threshold"].claim
+
+
 @pytest.mark.parametrize("stiffness", [1.0, 1e2, 1e4])
 def test_sums_of_columns_bound_integrals_and_are_near_them(stiffness: float) -> None:
     rng = np.random.default_rng([46, int(stiffness)])

@@ -27,7 +27,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delays import continuous_with_delays, plant_and_recovery, sample_time_of_delays
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
-from obsynth.plants.transformations.recovery import StateRecovery, Transformation
+from obsynth.plants.transformations.recovery import StateRecovery, Transformation, unchanged_states
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.design import Certificate, ObserverDesign
@@ -375,6 +375,10 @@ def draft_of(
     """Return the design that a synthesis stands for, without a report."""
     designed_for, source = plant, source_of(plant)
     if synthesis.plant is not None:
+        if recovery is not None and isinstance(plant, DescriptorSystem) and synthesis.plant.nx > plant.nx:
+            # Unknown inputs and noise that are estimated as states come after the plant's own.
+            leading = np.eye(plant.nx, synthesis.plant.nx)
+            recovery = recovery.then(unchanged_states(plant, plant, from_state=leading))
         plant = synthesis.plant
     if synthesis.transformation is not None:
         own = synthesis.transformation.recovery

@@ -66,7 +66,7 @@ class GuaranteedTestMethod(TestOptions, Method):
         How disturbances move within their bounds.  ``any``: as they like, between the samples of a plant that was
         sampled from a continuous one too; ``jump``: at will from sample to sample, held in between; ``held``: not at
         all over the window; ``rate``: by ``disturbance_rate``.  Whatever is not ``any`` is an assumption, which every
-        sentence repeats.  Of a plant that is given in discrete time ``any`` is ``jump``.
+        sentence repeats.  Of a plant that is given in discrete time, or that has delays, ``any`` is ``jump``.
     disturbance_rate : float or mapping of str to float, optional
         Largest change of each disturbance within the time of a sample.
     fault_rate : float, optional

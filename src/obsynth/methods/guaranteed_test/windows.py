@@ -62,9 +62,10 @@ def disturbances_in_words(window: Window) -> str:
             "any": "disturbances of any time course, between samples too",
             "rate": "disturbances that change within a sample's time by their stated rates at most",
         }[kind]
+    jump = "disturbances that are held between samples"
     return {
-        "any": "disturbances that may change from sample to sample",
-        "jump": "disturbances that are held between samples",
+        "any": jump,
+        "jump": jump,
         "held": "disturbances that are held over the window",
         "rate": "disturbances that are held between samples and change by their stated rates at most",
     }[kind]
