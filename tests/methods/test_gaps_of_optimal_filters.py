@@ -7,7 +7,7 @@ import pytest
 from benchmarks.campaigns import optimal_filters
 
 import obsynth
-from obsynth.verification.invisible_faults import with_independent_outputs
+from obsynth.verification.invisible_faults import Setting, proved_least, with_independent_outputs
 
 
 @pytest.mark.parametrize(
@@ -27,18 +27,19 @@ def test_gain_and_least_gain_of_a_random_plant_meet(seed: int, most: float) -> N
     assert outcome.value < most
 
 
-def read_by(mixing: np.ndarray) -> obsynth.DescriptorSystem:
+def read_by(mixing: np.ndarray, dt: float = 1.0) -> obsynth.DescriptorSystem:
     """Return a plant whose outputs are combinations of three."""
     rng = np.random.default_rng(4)
     a = rng.standard_normal((3, 3))
     a *= 0.8 / max(abs(np.linalg.eigvals(a)))
+    a -= np.eye(3) if dt == 0.0 else 0.0
     return obsynth.DescriptorSystem(
         A=a,
         C=mixing @ rng.standard_normal((3, 3)),
         Bf=rng.standard_normal((3, 1)),
         Bw=np.hstack([0.3 * rng.standard_normal((3, 2)), np.zeros((3, 3))]),
         Dw=np.hstack([np.zeros((len(mixing), 2)), 0.3 * mixing]),
-        dt=1.0,
+        dt=dt,
     )
 
 
@@ -59,3 +60,78 @@ def test_a_sensor_that_is_a_copy_but_for_its_last_digit_is_not_left_out_of_a_pro
     nearly[3, 0] = np.nextafter(nearly[3, 0], np.inf)
     assert with_independent_outputs(plant).output_names == plant.output_names[:3]
     assert with_independent_outputs(plant.replace(C=nearly)).ny == 4
+
+
+#: What the last output shows is what the first two show together, but for rounding.
+NEARLY_COPIED = np.vstack([np.eye(3), [0.3, 1.7, 0.0]])
+TIMES = {"discrete": (1.0, {"delay": 1}), "continuous": (0.0, {"reference": {"bandwidth": 2.0}})}
+
+
+@pytest.mark.parametrize("time", TIMES)
+def test_a_sensor_that_depends_on_others_but_for_rounding_leaves_the_least_gain_proved(time: str) -> None:
+    dt, options = TIMES[time]
+    once = obsynth.optimal_filter(read_by(np.eye(3), dt), **options)
+    plant = read_by(NEARLY_COPIED, dt)
+    assert with_independent_outputs(plant).ny == 4
+    more = obsynth.optimal_filter(plant, **options)
+    assert more.report.passed
+    assert once.least * (1 - 2e-8) <= more.least <= once.least
+    assert more.gain == pytest.approx(once.gain, rel=1e-8)
+    assert "from y4, which depends on the other outputs but for rounding" in more.notes[0]
+    assert {row.name: row.kind for row in more.report.checks}["least gain"] == "proved"
+
+    def failing(claims: dict[str, float], **matrices: np.ndarray) -> set[str]:
+        certificate = more.certificate
+        changed = obsynth.Certificate({**certificate.matrices, **matrices}, {**certificate.claims, **claims})
+        return {check.name for check in obsynth.verify(more.replace(certificate=changed)).failures}
+
+    limit = more.certificate.claims["answer_limit"]
+    assert not failing({"answer_limit": 0.1 * limit})
+    assert "least gain" in failing({"answer_limit": 1e4 * limit})
+    assert "least gain" in failing({}, dependent=np.array([[2.0]]))
+    assert failing({"answer_limit": -limit}) == {"fits the plant"}
+    assert failing({}, dependent=np.array([[4.0]])) == {"fits the plant"}
+
+
+@pytest.mark.parametrize("time", TIMES)
+def test_a_bound_beside_an_output_that_shows_something_is_below_the_gain_of_filters_that_read_it(time: str) -> None:
+    """The last output is no combination of others: filters that answer it more may have less gain."""
+    dt, options = TIMES[time]
+    plant = read_by(np.eye(3), dt)
+    setting = Setting((1,), (), True) if dt else Setting((), (([[-2.0]], [[2.0]], [[1.0]], [[0.0]]),), True)
+    setting = setting._replace(models=tuple(tuple(np.array(part) for part in model) for model in setting.models))
+    without = obsynth.optimal_filter(read_by(np.eye(3)[:2], dt), **options)
+    points = [complex(*pair) for pair in without.certificate.matrices["invisible"]]
+    samples = int(without.certificate.matrices["samples"][0, 0])
+
+    def bound(answer_limit: float) -> float:
+        limited = setting._replace(dependent=(2,), answer_limit=answer_limit)
+        return proved_least(plant, points, samples, limited, level=without.least) or 0.0
+
+    assert bound(0.0) == pytest.approx(without.least, rel=1e-8)
+    assert without.least > bound(1e-3) > bound(1e-2) > 0.0
+    design = obsynth.optimal_filter(plant, **options)
+    observer = design.observer
+    angles = np.exp(1j * np.linspace(0.0, np.pi, 400))
+    gains = [
+        np.linalg.norm(observer.Cz @ np.linalg.solve(p * np.eye(observer.order) - observer.Az, observer.By[:, 2:]), 2)
+        for p in (angles if dt else 1j * np.tan(np.angle(angles[:-1]) / 2))
+    ]
+    own = max(gains) + float(np.abs(observer.Dy[0, 2]))
+    assert bound(own) <= design.gain < without.least
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_equations_and_states_in_units_of_their_own_leave_gain_and_least(dt: float) -> None:
+    """Of E with entries from 1e-4 to 1e8, equations were taken for algebraic ones, and the filter failed."""
+    rng = np.random.default_rng(4)
+    a = rng.normal(size=(4, 4))
+    a = 0.8 / max(abs(np.linalg.eigvals(a))) * a - (np.eye(4) if dt == 0.0 else 0.0)
+    c, fault, noise = rng.normal(size=(2, 4)), rng.normal(size=(4, 1)), np.eye(4, 3) * 0.3 * rng.normal(size=(4, 1))
+    plant = obsynth.DescriptorSystem(A=a, C=c, Bf=fault, Bw=noise, Dw=0.3 * np.eye(2, 3, k=1), dt=dt)
+    left, right = np.diag([1e4, 1e-4, 1.0, 1.0]), np.diag([1e4, 1.0, 1e-4, 1.0])
+    scaled = plant.replace(E=left @ right, A=left @ a @ right, C=c @ right, Bf=left @ fault, Bw=left @ noise)
+    own, other = (obsynth.optimal_filter(one, reference={"bandwidth": 0.7}, exact=False) for one in (plant, scaled))
+    assert other.report.passed
+    assert other.gain == pytest.approx(own.gain, rel=1e-7)
+    assert other.least == pytest.approx(own.least, rel=1e-7)

@@ -20,6 +20,7 @@ from obsynth.verification.invisible_faults import (
     exact_kernel,
     has_index_one,
     hidden_and_bounded,
+    without_dependent,
     worst_ratio,
 )
 
@@ -36,6 +37,7 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
     """
     if plant.is_discrete or not setting.models or not has_index_one(plant):
         return None
+    plant, faint = without_dependent(plant, setting)
     (bh, dh), (bw, dw) = hidden_and_bounded(plant, setting)
     nx, ny = plant.nx, plant.ny
     rows = [
@@ -44,7 +46,13 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
         np.hstack([plant.C, np.zeros((ny, nx)), dh, dw]),
     ]
     with flint.ctx.workprec(PRECISION_BITS[0]):
-        inputs = _rows(exact_kernel(np.vstack(rows)), 2 * nx)
+        signals = exact_kernel(np.vstack(rows))
+        inputs, answered = _rows(signals, 2 * nx), None
+        if faint is not None:
+            rows_shown = np.hstack([faint.C, np.zeros((len(faint.C), nx)), faint.Dh, faint.Dw])
+            shown = flint.acb_mat(*rows_shown.shape, rows_shown.ravel().tolist()) * signals
+            shown = shown * flint.acb(faint.answer_limit)
+            answered = shown.transpose() * shown
         first = 0 if setting.exact else bh.shape[1]
         faults = _rows(inputs, first, first + plant.nf)
         noise = _rows(inputs, bh.shape[1])
@@ -52,7 +60,7 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
         for *_, direct in setting.models:
             error = flint.acb_mat(len(direct), direct.shape[1], direct.ravel().tolist()) * error
         try:
-            return worst_ratio(error.transpose() * error, noise.transpose() * noise, None)
+            return worst_ratio(error.transpose() * error, noise.transpose() * noise, None, answered=answered)
         except ZeroDivisionError:  # a matrix is singular to these digits
             return None
 

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.proofs.exact_arithmetic import stored_matrix
@@ -57,11 +57,18 @@ MOST_UNKNOWNS = 120
 
 class Setting(NamedTuple):
     """What the filter must do: ``delays`` in samples of each fault, and models that the faults pass one after the other
-    to what is wanted (a reference model, a weight of its error); whether the fault map is exact."""
+    to what is wanted (a reference model, a weight of its error); whether the fault map is exact.
+
+    ``dependent``: outputs, by their places, which signals may show a little, where the filters in question answer them,
+    with the others at zero, by at most ``answer_limit`` times the energy: as a rule, combinations of the others but for
+    rounding.
+    """
 
     delays: tuple[int, ...]
     models: tuple[Model, ...]
     exact: bool
+    dependent: tuple[int, ...] = ()
+    answer_limit: float = 0.0
 
     @property
     def longest(self) -> int:
@@ -95,9 +102,43 @@ def with_independent_outputs(plant: DescriptorSystem) -> DescriptorSystem:
     if rank == plant.ny:
         return plant
     entries, width = echelon.entries(), plant.ny
-    own = [next(j for j in range(width) if entries[i * width + j] != 0) for i in range(rank)]
+    return with_outputs(plant, [next(j for j in range(width) if entries[i * width + j] != 0) for i in range(rank)])
+
+
+def with_outputs(plant: DescriptorSystem, places: Sequence[int]) -> DescriptorSystem:
+    """Return the plant with these of its outputs alone."""
+    own = [*places]
     rows = {name: getattr(plant, name)[own] for name in ("C", "D", "Df", "Dd", "Dw")}
     return plant.replace(**rows, output_names=[plant.output_names[i] for i in own])
+
+
+class Faint(NamedTuple):
+    """Rows ``C x + Dh h + Dw w`` of outputs that signals show a little, and the gain of a filter from them."""
+
+    C: FloatArray
+    Dh: FloatArray
+    Dw: FloatArray
+    answer_limit: float
+
+
+def nearly_dependent_outputs(plant: DescriptorSystem) -> tuple[int, ...]:
+    """Return the places of outputs that are combinations of the others but for rounding, decided in floating point."""
+    shown = np.hstack([plant.C, plant.Df, plant.Dd, plant.Dw])
+    rank = decide_rank(shown).rank
+    if rank == plant.ny:
+        return ()
+    *_, order = scipy.linalg.qr(equilibrate(shown).T, mode="economic", pivoting=True)
+    return tuple(sorted(int(i) for i in order[rank:]))
+
+
+def without_dependent(plant: DescriptorSystem, setting: Setting) -> tuple[DescriptorSystem, Faint | None]:
+    """Return the plant without the outputs that a setting calls dependent, and these."""
+    if not setting.dependent:
+        return plant, None
+    (_, dh), (_, dw) = hidden_and_bounded(plant, setting)
+    places = [*setting.dependent]
+    faint = Faint(plant.C[places], dh[places], dw[places], setting.answer_limit)
+    return with_outputs(plant, [i for i in range(plant.ny) if i not in setting.dependent]), faint
 
 
 def hidden_and_bounded(
@@ -143,14 +184,16 @@ def proved_least(
         return None
     if not all(_grows(flint.acb(point), plant) for point in points):
         return None
-    samples, plant = samples if plant.is_discrete else 0, with_independent_outputs(plant)
-    bound = _of_worst_directions(plant, points, samples, setting, level, level if enough is None else enough)
+    samples = samples if plant.is_discrete else 0
+    plant, faint = without_dependent(plant, setting)
+    plant = with_independent_outputs(plant)
+    bound = _of_worst_directions(plant, points, samples, setting, level, level if enough is None else enough, faint)
     if bound is not None:
         return bound
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                bound = _Trajectories(plant, points, samples, setting).bound(level, enough)
+                bound = _Trajectories(plant, points, samples, setting, faint=faint).bound(level, enough)
             except ZeroDivisionError:  # a matrix is singular to these digits
                 continue
         if bound is not None:
@@ -159,7 +202,13 @@ def proved_least(
 
 
 def _of_worst_directions(
-    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, level: float, enough: float
+    plant: DescriptorSystem,
+    points: Sequence[complex],
+    samples: int,
+    setting: Setting,
+    level: float,
+    enough: float,
+    faint: Faint | None = None,
 ) -> float | None:
     """Return the proved ratio of one direction of each point, where it is enough, or near the level or the best one."""
     try:
@@ -167,7 +216,8 @@ def _of_worst_directions(
         if directions is None:
             return None
         with flint.ctx.workprec(PRECISION_BITS[0]):
-            bound = _Trajectories(plant, points, samples, setting, directions=directions).bound(None, 0.0)
+            trajectories = _Trajectories(plant, points, samples, setting, directions=directions, faint=faint)
+            bound = trajectories.bound(None, 0.0)
     except (ZeroDivisionError, np.linalg.LinAlgError):
         return None
     needed = enough if enough > 0.0 else min(directions.ratio * SAME_RATIO, level * NEAR_LEVEL)
@@ -215,11 +265,12 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
     """
     if not _grows(flint.acb(point), plant):
         return None
-    plant = with_independent_outputs(plant)
+    plant, faint = without_dependent(plant, setting)
+    plant, setting = with_independent_outputs(plant), setting._replace(delays=())
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                trajectories = _Trajectories(plant, [point], 0, setting._replace(delays=()), conjugates=False)
+                trajectories = _Trajectories(plant, [point], 0, setting, conjugates=False, faint=faint)
                 bound = trajectories.bound(None)
             except ZeroDivisionError:
                 continue
@@ -306,8 +357,10 @@ class _Trajectories:
         *,
         conjugates: bool = True,
         directions: Directions | None = None,
+        faint: Faint | None = None,
     ) -> None:
         self.plant, self.setting, self.samples, self.directions = plant, setting, samples, directions
+        self.faint = faint
         (self.Bh, self.Dh), (self.Bw, self.Dw) = hidden_and_bounded(plant, setting)
         self.members: list[_Member] = []
         if directions is not None:
@@ -368,10 +421,12 @@ class _Trajectories:
 
     def bound(self, level: float | None, enough: float | None = None) -> float | None:
         """Return the proved ratio of the worst combination, rounded down; without a level of the largest one."""
-        return worst_ratio(*self._energies(), level, level if enough is None else enough)
+        error, noise, answered = self._energies()
+        return worst_ratio(error, noise, level, level if enough is None else enough, answered=answered)
 
-    def _energies(self) -> tuple[Any, Any]:
-        """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
+    def _energies(self) -> tuple[Any, Any, Any]:
+        """Return the energies of error, noise and what a filter may answer to outputs that are faint (``None`` for
+        none), as matrices on the members' coefficients and the last samples'."""
         points = [m.point for m in self.members]
         faults, noise, states = self._part("f"), self._part("w"), list[Any]()
         estimates = faults
@@ -380,15 +435,19 @@ class _Trajectories:
             states.append(inner)
         weights = _weights(points, discrete=self.plant.is_discrete)
         energies = [_weighted(part, weights) for part in (estimates, noise)]
+        signals = self._part("x"), self._part("h"), noise
+        energies += [] if self.faint is None else [_weighted(_answered(self.faint, *signals), weights)]
         if not self.samples:
-            return energies[0], energies[1]
+            return energies[0], energies[1], energies[2] if self.faint else None
         estimated = self.plant.nf if self.setting.exact else 0
         free = None if self.directions is None else self.directions.of_samples
-        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples, estimated, free=free)
+        rest, passed = _from_rest(
+            self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples, estimated, free=free
+        )
         # The members go on, and what starts from rest is added to them.
         own = 0 if self.setting.exact else self.Bh.shape[1]
-        tails, powers = [], [flint.acb(1) for _ in points]
-        for inputs in rest:
+        tails, answers, powers = [], list[Any](), [flint.acb(1) for _ in points]
+        for k, inputs in enumerate(rest):
             added = (
                 _rows(inputs, range(own, own + self.plant.nf)),
                 _rows(inputs, range(self.Bh.shape[1], inputs.nrows())),
@@ -396,6 +455,11 @@ class _Trajectories:
             tails.append(
                 [_beside([_scaled(part, powers), more]) for part, more in zip((faults, noise), added, strict=True)]
             )
+            if self.faint is not None and k < self.samples:
+                nh = self.Bh.shape[1]
+                from_rest = passed[k], _rows(inputs, range(nh)), _rows(inputs, range(nh, inputs.nrows()))
+                both = (_beside([_scaled(part, powers), more]) for part, more in zip(signals, from_rest, strict=True))
+                answers.append(_answered(self.faint, *both))
             powers = [power * point for power, point in zip(powers, points, strict=True)]
         count = len(points) + rest[0].ncols()
         padded = [_padded(part, count) for part in energies]
@@ -408,17 +472,26 @@ class _Trajectories:
             _rows(part, [i for i, late in enumerate(delays) if k + late < self.samples])
             for k, part in enumerate(outputs)
         ]
-        for which, samples in enumerate((outputs, [tail[1] for tail in tails])):
+        for which, samples in enumerate((outputs, [tail[1] for tail in tails], answers)):
             for sample in samples:
                 padded[which] = padded[which] + _adjoint(sample) * sample
-        return padded[0], padded[1]
+        return padded[0], padded[1], padded[2] if self.faint else None
 
 
-def worst_ratio(error: Any, noise: Any, level: float | None, enough: float | None = None) -> float | None:
+def _answered(faint: Faint, states: Any, hidden: Any, noise: Any) -> Any:
+    """Return the most that a filter may answer to outputs that are faint, signals as columns."""
+    shown = _complex(faint.C) * states + _complex(faint.Dh) * hidden + _complex(faint.Dw) * noise
+    return shown * flint.acb(faint.answer_limit)
+
+
+def worst_ratio(
+    error: Any, noise: Any, level: float | None, enough: float | None = None, *, answered: Any = None
+) -> float | None:
     """Return the ratio of two energies for one combination near the worst, rounded down: without a level the largest.
 
     Nothing is concluded from the level, near which the combination is looked for.  One in double precision is taken
-    where its ratio is ``enough``: more digits are a hundred times the work.
+    where its ratio is ``enough``: more digits are a hundred times the work.  ``answered``: the energy of what may be
+    taken off the error.
     """
     count = error.nrows()
     if not count:
@@ -430,24 +503,34 @@ def worst_ratio(error: Any, noise: Any, level: float | None, enough: float | Non
     if not significant:
         return None
     units = [(1 / flint.acb(sizes[i]).sqrt()).mid() for i in significant]
-    error, noise = (
+    energies = [
         _scaled(_scaled(_columns(_rows(part, significant), significant), units).transpose(), units).transpose()
-        for part in (error, noise)
-    )
+        for part in (error, noise, answered)
+        if part is not None
+    ]
+    error, noise = energies[:2]
     largest, combination = _largest_ratio(error, noise)
-    roughly = _ratio(error, noise, _complex(combination[:, None]))
+    roughly = _ratio(energies, _complex(combination[:, None]))
     if roughly is not None and enough is not None and roughly >= enough:
         return roughly
-    closely = _ratio(error, noise, _worst_combination(error, noise, largest if level is None else level))
+    closely = _ratio(energies, _worst_combination(error, noise, largest if level is None else level))
     return max((bound for bound in (roughly, closely) if bound is not None), default=None)
 
 
-def _ratio(error: Any, noise: Any, combination: Any) -> float | None:
-    """Return the ratio of two energies for a combination, rounded down; ``None`` where one of them may be zero."""
-    above, below = ((_adjoint(combination) * part * combination)[0, 0].real for part in (error, noise))
+def _ratio(energies: Sequence[Any], combination: Any) -> float | None:
+    """Return the ratio of error and noise of a combination, rounded down; ``None`` where one of them may be zero.
+
+    ``energies``: of both, and of what may be taken off the error, where there is a third.
+    """
+    above, below, *less = ((_adjoint(combination) * part * combination)[0, 0].real for part in energies)
     if not (above > 0 and below > 0):
         return None
-    ratio = (above.lower() / below.upper()).sqrt().lower()
+    # An energy whose ball reaches below zero is none above its upper end.
+    taken_off = sum((flint.arb(part.upper()).sqrt() for part in less), flint.arb(0))
+    error = (flint.arb(above.lower()).sqrt() - taken_off).lower()
+    if not error > 0:
+        return None
+    ratio = (error / flint.arb(below.upper()).sqrt()).lower()
     value = float(ratio) if ratio.is_finite() else 0.0
     return math.nextafter(value, 0.0) if value > 0.0 else None
 
@@ -484,15 +567,15 @@ def _from_rest(
     estimated: int,
     *,
     free: FloatArray | None = None,
-) -> list[Any]:
-    """Return the inputs ``(h, w)`` of each sample, solutions from rest with y = 0 as columns.
+) -> tuple[list[Any], list[Any]]:
+    """Return the inputs ``(h, w)``, and the states, of each sample, solutions from rest with y = 0 as columns.
 
     Of these, what is independent in w and the first ``estimated`` of h, the faults; or the one with some free entries.
     """
     system, places = _system_from_rest(plant, hidden, noise, samples)
     if free is not None:
         one = flint.acb_mat(_with_free(_real(system), *_pivots(system), _real(free[:, None])))
-        return [_rows(one, place) for place in places]
+        return [_rows(one, place) for place in places], _states_of(one, places, plant)
     try:
         pivots, others = _pivots(system)
         solved = _columns(_complex(system + 0j), pivots).solve(-_columns(_complex(system + 0j), others))
@@ -503,7 +586,22 @@ def _from_rest(
     parts = [_rows(solutions, place) for place in places]
     counted = [*range(estimated), *range(hidden[0].shape[1], len(places[0]))]
     independent = _independent(_stacked([_rows(part, counted) for part in parts]))
-    return [_columns(part, independent) for part in parts]
+    solutions = _columns(solutions, independent)
+    return [_columns(part, independent) for part in parts], _states_of(solutions, places, plant)
+
+
+def _states_of(solutions: Any, places: Sequence[range], plant: DescriptorSystem) -> list[Any]:
+    """Return the states of each sample of solutions from rest: before its inputs, of the first one what is loose."""
+    first = _zeros(plant.nx, solutions.ncols())
+    for row, state in enumerate(_loose_states(plant)):
+        for column in range(solutions.ncols()):
+            first[state, column] = solutions[row, column]
+    return [first, *(_rows(solutions, range(place.start - plant.nx, place.start)) for place in places[1:])]
+
+
+def _loose_states(plant: DescriptorSystem) -> list[int]:
+    """Return the states that no derivative or next sample holds: they may be anything at the start."""
+    return [i for i in range(plant.nx) if not plant.E[:, i].any()]
 
 
 def _system_from_rest(
@@ -520,8 +618,7 @@ def _system_from_rest(
     (bh, dh), (bw, dw) = hidden, noise
     inputs, through = np.hstack([bh, bw]), np.hstack([dh, dw])
     count = inputs.shape[1]
-    # States that no derivative or next sample holds may be anything at the start.
-    loose = [i for i in range(nx) if not plant.E[:, i].any()]
+    loose = _loose_states(plant)
     block, every = count + nx, samples + samples_after(plant)
     system = np.zeros((every * (nx + ny), len(loose) + every * block))
     places = []

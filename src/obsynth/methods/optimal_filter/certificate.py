@@ -15,14 +15,23 @@ from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
+from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
-from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit, with_independent_outputs
+from obsynth.verification.invisible_faults import (
+    Setting,
+    nearly_dependent_outputs,
+    proved_least,
+    proved_limit,
+    with_independent_outputs,
+    with_outputs,
+)
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
@@ -54,6 +63,9 @@ OFF_THE_EDGE = 1e-9
 #: Infinite frequency is so many times the Cayley point: what is not yet the limit there falls with its square, and
 #: double precision, in which directions are looked for, loses digits with it (1e9 left .14 of a gain of 1.03).
 INFINITE_FREQUENCY = 1e6
+#: Gains of filters from outputs that depend on others but for rounding, in units in which the plant is near one, and
+#: the share of a bound that they may cost: one of 1e4 is far beyond what noise allows, and 1e12 is rounding itself.
+ANSWER_LIMITS, ANSWERED_SHARE = (1e10, 1e8, 1e6, 1e4), 1e-8
 #: Last samples that are free beyond the delay, and unknowns of all of them that are solved for.
 MORE_SAMPLES, MOST_UNKNOWNS = 3, 150
 
@@ -97,7 +109,7 @@ def certified(
         )
     if chosen.is_nothing:
         return matrices, claims
-    return matrices | _lower_bounds(plant, chosen, claims), claims
+    return matrices | _lower_bounds(plant, chosen, observer, claims), claims
 
 
 def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str, float]:
@@ -135,17 +147,72 @@ def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.where(known, np.exp2(np.round(np.log2(np.where(known, sizes, 1.0)))), 1.0)
 
 
-def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
+def _lower_bounds(
+    plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, claims: dict[str, float]
+) -> dict[str, FloatArray]:
     """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
-    fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
-    independent = with_independent_outputs(plant)
-    if independent.ny < plant.ny:
+    read = with_independent_outputs(plant)
+    nearly = nearly_dependent_outputs(read)
+    read = with_outputs(read, [i for i in range(read.ny) if i not in nearly])
+    if read.ny < plant.ny:
         # The filter is one for added noise, and so is the worst noise: without the others it needs none.
-        worst = designed(independent, fault_map, "hinf")
+        worst = designed(read, chosen.fault_map, "hinf")
         chosen = chosen._replace(
             problem=worst.problem, limit=worst.limit, limit_angle=worst.limit_angle, decays=worst.decays
         )
-    setting, plant = fault_map.setting, fault_map.driven(independent)
+    matrices = _bounds_of_outputs(read, chosen, claims)
+    if not nearly:
+        return matrices
+    dependent = [i for i, name in enumerate(plant.output_names) if name not in read.output_names]
+    return _bounds_beside(plant, dependent, chosen, observer, (matrices, claims))
+
+
+def _bounds_beside(
+    plant: DescriptorSystem,
+    dependent: list[int],
+    chosen: Designed,
+    observer: LinearObserver,
+    of_others: tuple[dict[str, FloatArray], dict[str, float]],
+) -> dict[str, FloatArray]:
+    """Claim what is proved of filters with any gain from the other outputs, and a limited one from the dependent ones.
+
+    The limit is the largest of those that are tried that costs nothing; ``of_others``: witnesses and claims for the
+    others alone, of which only what is proved of all outputs is left.
+    """
+    (matrices, claims), units = of_others, PlantUnits.of(plant).rounded()
+    least, limit = claims.pop("least", None), claims.pop("non_causal_limit", None)
+    if least is None:
+        return {}
+    unit = float(np.max(units.faults, initial=0.0) * np.max(units.outputs[dependent]))
+    a, b, c, d = observer.Az, observer.By[:, dependent], observer.Cz, observer.Dy[:, dependent]
+    if not plant.is_discrete:
+        a, b, c, d = cayley(a, b, c, d, chosen.problem.alpha)
+    own_gain, plant = float(hinf_norm(a, b, c, d).upper), chosen.fault_map.driven(plant)
+    for share in ANSWER_LIMITS:
+        most = float(f"{share * unit:.0e}")
+        if most < own_gain:
+            break
+        setting = chosen.fault_map.setting._replace(dependent=tuple(dependent), answer_limit=most)
+        if not len(matrices["invisible"]) and not plant.is_discrete:
+            bound = proved_at_infinity(plant, setting)
+        else:
+            points, samples = [complex(*pair) for pair in matrices["invisible"]], int(matrices["samples"][0, 0])
+            bound = proved_least(plant, points, samples, setting, level=least * (1.0 - ANSWERED_SHARE))
+        if bound is None or bound < least * (1.0 - ANSWERED_SHARE):
+            continue
+        claims |= {"least": least * (1.0 - ANSWERED_SHARE), "answer_limit": most}
+        if limit is not None:
+            beside = proved_limit(plant, complex(*matrices["limit_point"][0]), setting)
+            if beside is not None and beside >= limit * (1.0 - ANSWERED_SHARE):
+                claims["non_causal_limit"] = limit * (1.0 - ANSWERED_SHARE)
+        return matrices | {"dependent": np.array([[float(i)] for i in dependent])}
+    return {}
+
+
+def _bounds_of_outputs(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
+    """Claim what is proved of every causal filter of a plant whose outputs are independent; return the witnesses."""
+    fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
+    setting, plant = fault_map.setting, fault_map.driven(plant)
     block = plant.nx + plant.nf + plant.nd + plant.nw
     samples = min(setting.longest + MORE_SAMPLES, max(setting.longest, 1) + MOST_UNKNOWNS // block)
     best_points: list[complex] = []

@@ -19,6 +19,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
@@ -145,6 +146,10 @@ def _fits(design: ObserverDesign) -> bool:
     if "least" in claims:
         shapes |= {"invisible": (len(matrices.get("invisible", ())), 2), "samples": (1, 1)}
     shapes |= {"limit_point": (1, 2)} if "non_causal_limit" in claims else {}
+    if ("dependent" in matrices) != ("answer_limit" in claims) or not claims.get("answer_limit", 1.0) > 0.0:
+        return False
+    if not _are_outputs(matrices.get("dependent"), plant):
+        return False
     needed = {"gain"} if options["norm"] == "hinf" else {"deviation", "least_deviation"}
     return bool(
         all(np.all(np.isfinite(part)) for part in parts)
@@ -206,8 +211,29 @@ def _decays(model: Model, plant: DescriptorSystem) -> bool:
     return not len(model[0]) or prove_contraction(model[0], discrete=plant.is_discrete) is not None
 
 
+def _are_outputs(places: FloatArray | None, plant: DescriptorSystem) -> bool:
+    """Whether places, where there are any, are those of some of the outputs, but not of all."""
+    if places is None:
+        return True
+    own = set(places.ravel().tolist())
+    return places.shape == (len(own), 1) and 0 < len(own) < plant.ny and own <= set(range(plant.ny))
+
+
 def _setting(design: ObserverDesign) -> Setting:
-    return _claimed_map(design).setting
+    setting, certificate = _claimed_map(design).setting, design.certificate
+    if "dependent" not in certificate.matrices:
+        return setting
+    places = tuple(int(place) for place in certificate.matrices["dependent"].ravel())
+    return setting._replace(dependent=places, answer_limit=claimed(certificate.claims, "answer_limit"))
+
+
+def _among(design: ObserverDesign) -> str:
+    """Return of which filters a bound is, where not of all."""
+    setting = _setting(design)
+    if not setting.dependent:
+        return ""
+    names = ", ".join(design.linear[0].output_names[place] for place in setting.dependent)
+    return f" and a gain of at most {setting.answer_limit:.3g} from {names}"
 
 
 def _claimed_map(design: ObserverDesign) -> FaultMap:
@@ -296,7 +322,7 @@ def _least(design: ObserverDesign, plant: DescriptorSystem) -> Check:
         bound = proved_least(plant, points, samples, _setting(design), level=stated)
     return _bound_row(
         "least gain",
-        "every causal filter, linear or not, with this fault map has at least this gain",
+        f"every causal filter, linear or not, with this fault map{_among(design)} has at least this gain",
         bound,
         stated,
         "faults and noise of ever higher frequency that no output shows"
@@ -310,7 +336,7 @@ def _limit(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     point = complex(*matrices["limit_point"][0])
     return _bound_row(
         "gain at any delay",
-        f"no delay of up to {LONGEST_DELAY} samples brings the gain of an exact fault map below this",
+        f"no delay of up to {LONGEST_DELAY} samples brings the gain of an exact fault map{_among(design)} below this",
         proved_limit(plant, point, _setting(design)),
         stated,
         "faults and noise of one frequency that no output shows",

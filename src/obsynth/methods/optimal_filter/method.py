@@ -114,6 +114,9 @@ class OptimalFilterMethod(Method):
         "gain": ClaimMeaning("", "largest gain of this filter from the noise to the error", "gain"),
         "least": ClaimMeaning("", "no causal filter with this fault map has a smaller gain", "least gain"),
         "non_causal_limit": ClaimMeaning("", "no delay brings the gain below this", "gain at any delay"),
+        "answer_limit": ClaimMeaning(
+            "", "gain of a filter from outputs that are others but for rounding, up to which least holds", "least gain"
+        ),
         "deviation": ClaimMeaning("", "root mean square of the error for white noise of unit intensity", "deviation"),
         "least_deviation": ClaimMeaning(
             "", "no causal linear filter with this fault map and errors that decay has less", "least deviation"
@@ -122,7 +125,8 @@ class OptimalFilterMethod(Method):
         "order": ClaimMeaning("", "states of the filter", "order"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
-        {"T", "T0", "stability", "P", "invisible", "samples", "limit_point"} | {f"reference_{name}" for name in "ABCD"}
+        {"T", "T0", "stability", "P", "invisible", "samples", "limit_point", "dependent"}
+        | {f"reference_{name}" for name in "ABCD"}
     )
     # Its estimates are of the faults, but which noise counts is the caller's choice: only who names it gets it.
     purposes: ClassVar[frozenset[Purpose]] = frozenset()

@@ -18,6 +18,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -340,7 +341,9 @@ def _left_kernel(e: FloatArray) -> FloatArray:
     others = e[~empty]
     if not len(others):
         return units
-    kernel = scipy.linalg.null_space(others.T, rcond=RANK_TOLERANCE).T
+    # Equations and states in units of their own: beside large entries of E small ones are no zeros.
+    rows, columns = equilibrating_factors(np.abs(others))
+    kernel = scipy.linalg.null_space((rows[:, None] * others * columns).T, rcond=RANK_TOLERANCE).T
     whole = np.zeros((len(kernel), len(e)))
-    whole[:, ~empty] = kernel
+    whole[:, ~empty] = kernel * rows
     return np.vstack([units, whole])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import Any, NamedTuple
@@ -237,7 +237,8 @@ def _made(
         "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
     gains = {"T": follower.T, "T0": follower.T0}
-    notes = tuple(_notes(plant, curve, chosen, method, claims))
+    dependent = [plant.output_names[int(place)] for place in matrices.get("dependent", np.zeros(0)).ravel()]
+    notes = tuple(_notes(plant, curve, chosen, method, claims, dependent))
     notes += (
         ()
         if chosen.least is None or method.order_limit is None
@@ -446,8 +447,9 @@ def _notes(
     chosen: Designed,
     options: OptimalFilterMethod,
     claims: Mapping[str, float],
+    dependent: Sequence[str],
 ) -> list[str]:
-    notes = [_statement(curve, chosen, options, claims)]
+    notes = [_statement(curve, chosen, options, claims, dependent)]
     if len(curve) > 1:
         listed = "; ".join(f"delay {_late(row)}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
         notes.append(f"Least gain, and least deviation for white noise of unit intensity, by delay: {listed}.")
@@ -464,7 +466,13 @@ def _notes(
     return notes
 
 
-def _statement(curve: list[_Row], chosen: Designed, options: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
+def _statement(
+    curve: list[_Row],
+    chosen: Designed,
+    options: OptimalFilterMethod,
+    claims: Mapping[str, float],
+    dependent: Sequence[str],
+) -> str:
     """Return what no filter beats, how near this one is to it, and what more delay would give."""
     fault_map = chosen.fault_map
     if not fault_map.exact:
@@ -486,6 +494,10 @@ def _statement(curve: list[_Row], chosen: Designed, options: OptimalFilterMethod
         # What holds at any delay holds at this one.
         least = max(claims.get("least", 0.0), claims.get("non_causal_limit", 0.0))
         low, high = bracketed(least, claims["gain"])
+        if dependent:
+            few = "depends" if len(dependent) == 1 else "depend"
+            of += f", whose gain from {', '.join(dependent)}, which {few} on the other outputs but for rounding,"
+            of += f" is at most {claims['answer_limit']:.3g}"
         of = f"from disturbances and noise together, {of}"
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
     places = [row.found.fault_map.delays for row in curve]
