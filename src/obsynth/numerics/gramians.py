@@ -23,3 +23,17 @@ def gramian(a: FloatArray, weight: FloatArray) -> FloatArray:
             if not np.isfinite(size) or size <= DOUBLED_SHARE * float(np.linalg.norm(total)):
                 break
     return np.asarray(total)
+
+
+def gramian_factor(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return R with ``R R' = sum_k a^k b b' a'^k``, n columns at most: small directions keep their digits."""
+    factor, power = np.array(b), np.array(a)
+    for _ in range(MOST_DOUBLINGS):
+        added = power @ factor
+        factor = np.hstack([factor, added])
+        if factor.shape[1] > len(a):
+            factor = np.asarray(np.linalg.qr(factor.T, mode="r")).T
+        if not float(np.linalg.norm(added)) > DOUBLED_SHARE * float(np.linalg.norm(factor)):
+            break
+        power = power @ power
+    return np.asarray(factor)

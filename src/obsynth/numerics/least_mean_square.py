@@ -27,6 +27,8 @@ from obsynth.numerics.standard_form import uncayley
 INFINITE_MODE = 1e-10
 #: White noise that passes to the error by less than this share is rounding.
 WHITE_SHARE = 1e-9
+#: What passes at once is a difference of products, of which this share is rounding.
+WHITE_ROUNDING = 1e3 * float(np.finfo(float).eps)
 #: Noise added to the outputs, of what the states' noise does to them, largest first.
 ADDED_NOISES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 #: Less noise is added until the mean square, its root, is so near the least one.
@@ -158,7 +160,8 @@ def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (
     split, added = _split(measured), noises[0]
     noisy = measured.d if split is None else split.noisy @ measured.d
     Z0 = d1 @ np.linalg.pinv(noisy)
-    if np.linalg.norm(d1 - Z0 @ noisy) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)):
+    cancelled = float(np.linalg.norm(problem.L) * np.linalg.norm(problem.B))
+    if np.linalg.norm(d1 - Z0 @ noisy) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)) + WHITE_ROUNDING * cancelled:
         raise PreconditionError(
             "White noise passes to the error whatever the filter: its mean square is infinite. Give a reference model "
             "of higher order, or norm hinf.",

@@ -76,6 +76,10 @@ UNDETERMINED_SHARE = 1e-8
 #: Singular values of a scaled exact Jacobian below this share of the largest are zero.
 JACOBIAN_RANK_TOLERANCE = 1e-9
 
+#: Hankel singular values below this share of the largest are rounding: those of long windows end at 1e-7, and rounding
+#: of the factors of their Gramians begins at 1e-16.
+HANKEL_SHARE = 1e-13
+
 #: Directions of a Riccati solution below this share are not told from zero.
 NEGLIGIBLE_SHARE = 1e-12
 

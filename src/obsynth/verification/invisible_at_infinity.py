@@ -50,7 +50,7 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
         inputs, answered = _rows(signals, 2 * nx), None
         if faint is not None:
             rows_shown = np.hstack([faint.C, np.zeros((len(faint.C), nx)), faint.Dh, faint.Dw])
-            shown = flint.acb_mat(*rows_shown.shape, rows_shown.ravel().tolist()) * signals
+            shown = flint.acb_mat(len(rows_shown), rows_shown.shape[1], rows_shown.ravel().tolist()) * signals
             shown = shown * flint.acb(faint.answer_limit)
             answered = shown.transpose() * shown
         first = 0 if setting.exact else bh.shape[1]

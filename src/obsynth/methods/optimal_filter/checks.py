@@ -364,7 +364,8 @@ def _bound_row(name: str, claim: str, bound: float | None, stated: float, detail
 
 def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) -> Check:
     deviation, source = channel.deviation(plant.dt), "Lyapunov equation"
-    if 0.0 < stated <= ROUNDING_ROOM * channel.rounding and deviation <= channel.rounding:
+    repeated = abs(deviation - stated) <= DEVIATION_SHARE * stated
+    if 0.0 < stated <= ROUNDING_ROOM * channel.rounding and deviation <= channel.rounding and not repeated:
         claim = "root mean square of the error for white noise: rounding, of which this is a bound"
         return upper_bound_check("deviation", claim, deviation, stated, source=source, kind="computed")
     # Of zero nothing but rounding may be left.

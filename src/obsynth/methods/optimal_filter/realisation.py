@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.gramians import gramian_factor
+from obsynth.numerics.ranks import HANKEL_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.verification.error_system import LEAST_ROW, with_past
+from obsynth.verification.error_system import IDENTITY_SHARE, LEAST_ROW, ErrorModel, with_past
 
 #: The identities of T and T0 hold to this, of the numbers in them: to the second where no realisation keeps the first.
 IDENTITIES_LEFT = (1e-9, 1e-8)
@@ -36,6 +37,8 @@ DISTURBANCE_LEFT = 1e-8
 ROUNDING_SHARE = 1e-14
 #: What passes at once and is smaller, of what passes by way of the states, is rounding: it is a difference of products.
 PASSED_ROUNDING = 1e-12
+#: Of a filter that otherwise follows nothing, entries below this share of the largest are rounding, of many products.
+COARSE_ROUNDING = 1e-12
 #: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
 ROUNDED_MODE = 1e-12
 #: Sweeps over all states until their units are balanced, but for a factor.
@@ -60,8 +63,8 @@ class Followed(NamedTuple):
     lag: int
 
 
-def minimal(filter_: Model, *, discrete: bool = False) -> Model:
-    """Return a filter without states that are not reached or not read."""
+def minimal(filter_: Model, *, discrete: bool | None = None) -> Model:
+    """Return a filter without states that are not reached or not read; ``discrete`` of a stable one, where known."""
     a, b, c, d = filter_
     # Of a filter of finite response nothing but rounding may be left of the modes.
     a = np.where(np.abs(a) > ROUNDED_MODE, a, 0.0) if discrete else a
@@ -69,23 +72,30 @@ def minimal(filter_: Model, *, discrete: bool = False) -> Model:
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
     basis = reachable_basis(a.T, c.T)
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
-    passed = float(np.linalg.norm(d) + np.linalg.norm(c) * np.linalg.norm(b))
+    # Of what passes by way of the states in the end: in continuous time the sizes of b are those of rates.
+    driven = np.linalg.lstsq(a, b, rcond=None)[0] if discrete is False and len(a) else b
+    passed = float(np.linalg.norm(d) + np.linalg.norm(c) * np.linalg.norm(driven))
     return _cleaned(a), _cleaned(b), _cleaned(c), np.where(np.abs(d) > PASSED_ROUNDING * passed, d, 0.0)
 
 
 def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list[Model]:
-    """Return the minimal realisation, and one without the states that by their zeros are not reached or not read.
+    """Return the minimal realisation, and others that keep digits which it loses.
 
-    Of a long window the first keeps no digits of coefficients that are as small as rounding; the second does.
+    Of a long window it keeps no digits of coefficients that are as small as rounding.  In sampled time a balanced one
+    does, and one without the states that by their zeros are not reached or not read; the first has fewer states.
     ``outputs (ny,)``: units, powers of two, in which the outputs are near one: what is rounding is judged in them.
     """
     a, b, c, d = filter_
     filter_ = _without_rounding((a, b / outputs, c, d / outputs))
     minimal_ones = [minimal(filter_, discrete=discrete)]
     if discrete:
+        minimal_ones.append(_without_small_responses(filter_))
         a, b, c, d = filter_
         linked = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
         minimal_ones.append(_balanced((a[np.ix_(linked, linked)], b[linked], c[:, linked], d)))
+    a, b, c, d = (_cleaned(part, COARSE_ROUNDING) for part in minimal_ones[0])
+    if not all(np.array_equal(part, other) for part, other in zip((a, b, c, d), minimal_ones[0], strict=True)):
+        minimal_ones.append((a, b, c, d))
     return [(a, b * outputs, c, d * outputs) for a, b, c, d in minimal_ones]
 
 
@@ -95,6 +105,17 @@ def _without_rounding(filter_: Model) -> Model:
     size = ROUNDING_SHARE * float(np.linalg.norm(d))
     input_size, output_size = float(np.linalg.norm(b)), float(np.linalg.norm(c))
     return a, np.where(np.abs(b) * output_size > size, b, 0.0), np.where(np.abs(c) * input_size > size, c, 0.0), d
+
+
+def _without_small_responses(filter_: Model) -> Model:
+    """Return a sampled filter in balanced states, without those whose Hankel singular value is rounding."""
+    a, b, c, d = filter_
+    reached, read = gramian_factor(a, b), gramian_factor(a.T, c.T)
+    left, values, right = np.linalg.svd(read.T @ reached, full_matrices=False)
+    own = values > HANKEL_SHARE * np.max(values, initial=0.0)
+    roots = np.sqrt(values[own])
+    into, out = read @ left[:, own] / roots, reached @ right[own].T / roots
+    return _cleaned(into.T @ a @ out), _cleaned(into.T @ b), _cleaned(c @ out), d
 
 
 def _balanced(filter_: Model) -> Model:
@@ -122,9 +143,9 @@ def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.boo
     return linked
 
 
-def _cleaned(matrix: FloatArray) -> FloatArray:
+def _cleaned(matrix: FloatArray, share: float = ROUNDING_SHARE) -> FloatArray:
     """Return a matrix without entries that are rounding of its largest."""
-    return np.where(np.abs(matrix) > ROUNDING_SHARE * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
+    return np.where(np.abs(matrix) > share * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
 def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) -> Followed:
@@ -141,6 +162,9 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
             continue
         for filter_ in filters:
             follower, share = _followed(plant, filter_, rows, moved, lag)
+            if follower is not None and len(rows) and not _is_followed(plant, follower):
+                # Copies that are hardly read were left out, of which a filter that follows little else has much.
+                continue
             if follower is not None and share == IDENTITIES_LEFT[0]:
                 return follower
             less_exact = less_exact or follower
@@ -150,6 +174,14 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
         "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
         "(sensor_noise), or give a longer delay."
     )
+
+
+def _is_followed(plant: DescriptorSystem, follower: Followed) -> bool:
+    """Whether a filter with its copies keeps the identities, of the numbers that are stored, as they are verified."""
+    names = tuple(f"estimate {i + 1}" for i in range(len(follower.C)))
+    observer = observer_of(plant, follower, names, (0,) * len(names))
+    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
+    return model.missed() <= IDENTITY_SHARE
 
 
 def observer_of(
