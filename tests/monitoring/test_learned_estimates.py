@@ -124,7 +124,11 @@ def test_a_fault_that_the_estimate_follows_is_an_alarm() -> None:
     assert found.columns == ("r[y]",)
     assert found.statistics.names[-2:] == ("GLR of a change of fhat[f]", "square of fhat[f]")
     assert "and in changes of 1 fault;" in found.statement
-    alone = replace(found, statistics=replace(found.statistics, estimates=()), levels=found.levels[:-2])
+    assert found.ranges is not None
+    assert found.ranges.rates is not None
+    ranges = found.ranges._replace(rates=found.ranges.rates[:, :-2])
+    statistics = replace(found.statistics, estimates=())
+    alone = replace(found, statistics=statistics, levels=found.levels[:-2], ranges=ranges)
     for one, wanted in ((found, True), (alone, False)):
         monitor = obsynth.online_monitor(pumped(), "learned", normal=one)
         run = obsynth.run_on_data(pumped(), log(500, 2, begin=300), monitor=monitor)
