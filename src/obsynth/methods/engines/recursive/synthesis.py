@@ -34,6 +34,8 @@ from obsynth.results.design import Certificate
 
 #: Information on the parameters in a window below this share of their prior's is as good as none.
 LOST_EXCITATION = 1.0
+#: `check` forms gains of plants of at most so many states: of 196 states it takes two seconds.
+MOST_STATES_TO_FORM_GAINS = 60
 
 
 def synthesise(
@@ -57,12 +59,16 @@ def synthesise(
 def require_gains(plant: DescriptorSystem | TimeVaryingDescriptorSystem, method: Method) -> None:
     """Raise `PreconditionError` where the noise as stated allows no gains, or none with which errors decay.
 
-    Asked where some equation or output has no noise; where all have, the conditions of existence decide."""
+    Asked where some equation or output has no noise; where all have, the conditions of existence decide.  Of plants of
+    many states it is asked by a design only: gains are formed step by step, which takes seconds.
+    """
     options = method.as_given()
     if shared_noise(plant, Q=options["Q"], R=options["R"]) is None:
         options = with_stated_noise(plant, options)
         if all(options[name] is None or _is_definite(options[name]) for name in ("Q", "R")):
             return
+    if plant.nx > MOST_STATES_TO_FORM_GAINS:
+        return
     synthesise(plant, method, progress=lambda _: None)
 
 
