@@ -6,7 +6,6 @@ import functools
 import math
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -284,7 +283,7 @@ def test_powers_of_matrices_whose_entries_cancel_are_those_of_their_eigenvalues(
 @pytest.mark.parametrize("name", ["wang2015", "filasova"])
 def test_shipped_designs_are_compared(name: str) -> None:
     spec = obsynth.load_spec(f"designs/{name}/spec.yaml")
-    scenario = replace(spec.scenario, horizon=min(spec.scenario.horizon, 120.0 if name == "wang2015" else 13.0))
+    scenario = spec.scenario.replace(horizon=min(spec.scenario.horizon, 120.0 if name == "wang2015" else 13.0))
     found = obsynth.compare(spec.plant, scenario=scenario, runs=1, methods=["fault-estimation-filter"])
     assert np.isfinite(found.methods[0].relative_error)
 

@@ -316,7 +316,8 @@ def _with_enough_noise(
             follower, observer, missed = _realised(plant, chosen)
             exact = chosen.fault_map.exact and bool(more)
             missed = missed if exact else 0.0
-            if more and norm == "h2" and not plant.is_discrete:
+            # Noise that carries none, beside undriven modes, would count in the mean square of this plant.
+            if more and norm == "h2" and not plant.is_discrete and not chosen.fault_map.undriven:
                 missed = max(missed, _lost_share(plant, chosen, follower, observer))
             if missed <= EXACT_SHARE:
                 return chosen, follower, observer
