@@ -5,6 +5,8 @@ prints a table, and ends with exit code 1 where a ratio is more than twice its b
 ``--write`` takes ten seeds and writes the table into ``benchmarks/README.md``; ``--small`` runs one small instance of
 each case.
 Processor time (user and system) on one BLAS thread; memory is the peak of the process until the case was done.
+What else a machine does only adds time (the same design took 1.2 and 3.5 s within an hour): where a ratio is too large,
+all is measured anew in a fresh process, twice at most, and the least ratio of each case counts.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import hashlib
 import json
+import multiprocessing
 import resource
 import statistics
 import subprocess
@@ -25,6 +28,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,6 +47,8 @@ ROOT, BOUNDS = HERE.parent, HERE / "gate_bounds.json"
 SEEDS, SEEDS_OF_THE_TABLE = 5, 10
 #: Fails where a ratio is above its bound by more than this factor.
 ALLOWED = 2.0
+#: So many times everything is measured again where a ratio is too large.
+MEASURED_AGAIN = 2
 #: The table in the README stands between these lines.
 BEGIN, END = "<!-- gate -->", "<!-- end of gate -->"
 
@@ -275,8 +281,9 @@ def main() -> int:
     lines = ["| case | ours, s: median, worst | anchor | anchor, s | worst / anchor | bound | MB so far |",
              "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     print("\n".join(lines), flush=True)
-    missed = []
-    for case, memory in cases(seeds_of(commit(options.commit), count), small=options.small):
+    missed: dict[str, str] = {}
+    seeds = seeds_of(commit(options.commit), count)
+    for case, memory in cases(seeds, small=options.small):
         bound = bounds.get(case.name)
         lines.append(
             f"| {case.name} | {statistics.median(case.ours):.3g}, {max(case.ours):.3g} | {case.anchor} | "
@@ -284,14 +291,33 @@ def main() -> int:
         )
         print(lines[-1], flush=True)
         if bound is None and not options.small:
-            missed.append(f"{case.name}: no bound in {BOUNDS.name}")
+            missed[case.name] = f"no bound in {BOUNDS.name}"
         elif bound is not None and not options.small and case.ratio > ALLOWED * bound:
-            missed.append(f"{case.name}: {case.ratio:.3g} times {case.anchor}, more than {ALLOWED:g} times {bound}")
+            missed[case.name] = f"{case.ratio:.3g} times {case.anchor}, more than {ALLOWED:g} times {bound}"
     if options.write:
         write(lines, BEGIN, END)
-    for text in missed:
-        print(f"MISSED: {text}", file=sys.stderr)
+    for _ in range(MEASURED_AGAIN):
+        if not missed.keys() & bounds.keys():
+            break
+        again = ratios_of_a_fresh_process(seeds)
+        print("measured again:", ", ".join(f"{name} {again[name]:.3g}" for name in missed if name in again), flush=True)
+        missed = {
+            name: text for name, text in missed.items() if again.get(name, np.inf) > ALLOWED * bounds.get(name, 0.0)
+        }
+    for name, text in missed.items():
+        print(f"MISSED: {name}: {text}", file=sys.stderr)
     return 1 if missed else 0
+
+
+def ratios(seeds: Sequence[int]) -> dict[str, float]:
+    """Return the ratio of each case."""
+    return {case.name: case.ratio for case, _ in cases(seeds, small=False)}
+
+
+def ratios_of_a_fresh_process(seeds: Sequence[int]) -> dict[str, float]:
+    """Return the ratio of each case, measured where nothing is remembered."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+        return process.submit(ratios, seeds).result()
 
 
 def write(lines: Sequence[str], begin: str, end: str) -> None:
