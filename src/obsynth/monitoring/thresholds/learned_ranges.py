@@ -34,9 +34,7 @@ class LearnedRanges(NamedTuple):
     low: FloatArray
     high: FloatArray
     point: FloatArray  # what makes deviations absolute
-    rates: FloatArray | None = (
-        None  # ``(nu, k)``: shares of the root of each level that follow an input; by default one
-    )
+    rates: FloatArray | None = None  # ``(nu, k)``: shares of the root of each level that follow an input; else one
 
     def middle_and_half(self) -> tuple[FloatArray, FloatArray]:
         """Return the middle ``(nu,)`` of the range of each input and half of its width, infinite where an input was

@@ -196,7 +196,8 @@ def learn_thresholds(
     output = output.of_rows(wanted)
     dt = _sample_time(design, output)
     known_inputs = len(signals.names) - len(logs.repeats)
-    offsets = sensor_deviations(design, signals.deviations(logs.rows)[:, -len(logs.repeats) :])
+    deviations = signals.deviations(logs.rows)
+    offsets = sensor_deviations(design, deviations[:, -len(logs.repeats) :])
     drifts = _drifts(design, lambda: new_run(sizes, starts), logs, sensor_drift * offsets) if sensor_drift else None
     options: dict[str, Any] = {
         "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs,
@@ -219,11 +220,9 @@ def learn_thresholds(
     )
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     inputs = logs.rows[output.numbers, 1 : 1 + signals.inputs]
-    ranges = ranges_of_rows(signals, signals.deviations(logs.rows[np.unique(output.numbers)]), known_inputs)
-    distances = ranges.distances(signals.deviations(logs.rows[output.numbers])[:, :known_inputs])
-    rates = range_rates(
-        distances, white, learned.statistics, learned.levels, output.scores, learned.centres, options["logs"]
-    )
+    ranges = ranges_of_rows(signals, deviations[np.unique(output.numbers)], known_inputs)
+    distances = ranges.distances(deviations[output.numbers, :known_inputs])
+    rates = range_rates(distances, white, learned, output.scores, options["logs"])
     divided = divided_at_starts(design.observer, output.scores if learned.statistics.estimates else None)
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
     return replace(

@@ -16,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import Scores, change_ratios
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
@@ -51,27 +52,27 @@ class _Rows:
 def range_rates(
     distances: FloatArray,
     white: FloatArray,
-    statistics: Statistics,
-    levels: FloatArray,
+    learned: LearnedThresholds,
     scores: Scores | None,
-    centre: FloatArray,
     logs: Sequence[slice],
 ) -> FloatArray:
-    """Return which share of the root of each level follows each input, ``(nu, k)``, from whitened rows ``(n, m)`` of
-    logs and the ``distances (n, nu)`` of their inputs from the middles of their ranges, in halves of these; ``scores``:
-    what these rows say of faults, and ``centre`` where these are."""
+    """Return which share of the root of each learned level follows each input, ``(nu, k)``, from whitened rows
+    ``(n, m)`` of logs and the ``distances (n, nu)`` of their inputs from the middles of their ranges, in halves of
+    these; ``scores``: what these rows say of faults."""
     from scipy.special import stdtrit
 
     known = np.asarray(np.isfinite(white).all(axis=1))
     distances = _held(distances)
     moves = np.ptp(distances, axis=0) > 0.0
+    statistics, levels = learned.statistics, learned.levels
     rates = np.ones((distances.shape[1], len(levels)))
     if not moves.any():
         return read_only(rates)
     own = distances[:, moves]
     rows = _Rows(
         tuple(_regressors(column) for column in own.T), own, np.where(known[:, None], white, 0.0), known,
-        replace(statistics, bands=None), levels, scores if statistics.estimates else None, centre,
+        replace(statistics, bands=None), levels, scores if statistics.estimates else None,
+        learned.centres,
     )  # fmt: skip
     blocks = _blocks(len(white), logs)
     without = np.array([_rates(rows, without_block) for without_block in blocks])
