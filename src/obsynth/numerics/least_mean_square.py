@@ -188,10 +188,7 @@ def _of_the_rest(
     Z0, rows = wanted
     error_rows = rows - Z0 @ c
     least = _least(split.rest, error_rows @ N)
-    if added:
-        K, noise = _gain_with_noise(split.rest, added), added
-    else:
-        K, noise = _gain_near_the_least(split.rest, error_rows @ N, least)
+    K, noise = _gain_of_the_rest(split.rest, error_rows @ N, least, added=added)
     K1, K2 = K[:, : len(split.noisy)], K[:, len(split.noisy) :]
     driven = N.T @ a - K1 @ split.noisy @ c - K2 @ split.shown @ c @ a
     exact = (N @ K2 + split.known) @ split.shown @ residual
@@ -205,23 +202,20 @@ def _of_the_rest(
     return ContinuousFilter(filter_, deviation, least if least > ROUNDING_SHARE * deviation else 0.0, noise)
 
 
-def _gain_near_the_least(rest: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
-    """Return the gain of least mean square, or one for added noise that comes near to it, and that noise."""
+def _gain_of_the_rest(rest: _Measured, wanted: FloatArray, least: float, *, added: float) -> tuple[FloatArray, float]:
+    """Return the gain for ``added`` noise, or as much as the problem needs, and that noise; outputs that show nothing
+    have none."""
     shows = rest.shows()
     live = rest.of_rows(shows)
-    gain, noise = np.zeros((len(rest.a), len(rest.c))), 0.0
-    if _split(live) is None:
-        gain[:, shows] = live.gain()
+    if added:
+        own, noise = live.with_noise(added).gain(), added
+    elif _split(live) is None:
+        own, noise = live.gain(), 0.0
     else:
-        gain[:, shows], noise = _noisy_gain(live, wanted, least)
+        own, noise = _noisy_gain(live, wanted, least)
+    gain = np.zeros((len(rest.a), len(rest.c)))
+    gain[:, shows] = own
     return gain, noise
-
-
-def _gain_with_noise(measured: _Measured, share: float) -> FloatArray:
-    shows = measured.shows()
-    gain = np.zeros((len(measured.a), len(measured.c)))
-    gain[:, shows] = measured.of_rows(shows).with_noise(share).gain()
-    return gain
 
 
 def _noisy_gain(measured: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
