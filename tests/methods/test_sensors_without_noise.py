@@ -159,3 +159,39 @@ def test_a_mean_square_that_has_lost_its_digits_is_none() -> None:
     T = np.array([[-0.29661771, -0.29661771], [-0.70710678, -0.70710678], [-0.70710678, 0.70710678]])
     model = ErrorModel(design.plant, observer, T, np.zeros((1, 2)), decoupled=True)
     assert np.isnan(ErrorChannel(model, REFERENCE).deviation(0.0))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_where_no_output_shows_the_faults_the_estimate_is_zero(order: int) -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.0]],
+        Bf=[[0.0]],
+        Bw=[[2.5, 1.0, -0.5]],
+        C=[[0.5], [0.5], [-1.0]],
+        Dw=[[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.5, 1.0, -0.5]],
+        dt=0.0,
+    )
+    design = obsynth.optimal_filter(plant, norm="h2", exact=False, reference={"bandwidth": 2.0, "order": order})
+    claims = design.certificate.claims
+    # The mean square of the reference model alone: 2 / (s + 2), or its square.
+    assert claims["least_deviation"] == claims["deviation"] == pytest.approx(1.0 / np.sqrt(order), rel=1e-12)
+    assert design.observer.order == 0
+    assert not design.observer.Dy.any()
+
+
+def test_outputs_that_are_read_at_once_by_rounding_pass_no_white_noise() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 1.0, 0.0]),
+        A=[[0.5, 0.5, 0.0], [0.5, 0.0, 0.0], [0.0, -1.0, 1.5]],
+        B=[[1.5], [0.0], [-0.5]],
+        Bf=[[2.5], [0.0], [0.0]],
+        Bw=[[1.0], [-1.0], [1.5]],
+        C=[[-1.0, -1.5, -1.0], [-1.0, 0.5, 1.0], [-1.0, 2.0, -0.5]],
+        Dw=[[0.0], [-1.5], [0.0]],
+        dt=0.0,
+    )
+    design = obsynth.optimal_filter(plant, norm="h2", exact=False, reference={"bandwidth": 2.0, "order": 2})
+    claims = design.certificate.claims
+    assert claims["least_deviation"] == 0.0
+    assert claims["deviation"] <= 1e-3
+    assert design.report.passed

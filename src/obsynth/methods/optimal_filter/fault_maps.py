@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
@@ -25,6 +26,7 @@ from obsynth.numerics.least_estimation import (
     require_stable_filter,
 )
 from obsynth.numerics.least_mean_square import least_mean_square
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.standard_form import cayley, cayley_point, finite_poles, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
@@ -36,6 +38,8 @@ from obsynth.verification.weighted_plant import weighted_plant
 
 #: A gain below this share of what the faults do to the error without a filter is zero but for rounding.
 ZERO_GAIN = 1e-9
+#: A filter whose deviation is by no more than this share below that of the estimate zero reads rounding.
+NO_LESS = 1e-12
 
 _SOURCE = "Varga 2017, section 5.2, and ours"
 
@@ -338,6 +342,8 @@ def designed(
             nothing = filter_[0]
             least = LeastEstimation(nothing, nothing, gain, 0.0, 0.0, continuous.added_noise, ())
             least_gain = continuous.least * ratio if continuous.added_noise else None
+            if not fault_map.exact and gain * ratio >= _deviation_without_filter(fault_map) * (1.0 - NO_LESS):
+                filter_ = _no_filter(len(filter_[3]), plant.ny)
         else:
             least, least_gain = least_estimation(problem, norm=norm, noises=noises), None
             filter_, gain = realised(problem, least.K, least.Z0, plant.ny), least.gain
@@ -364,6 +370,19 @@ def _reference_gain(plant: DescriptorSystem, fault_map: FaultMap, alpha: float) 
     """Return the gain from the faults to the error without any filter."""
     model = reduce(in_series, fault_map.setting.models)
     return float(hinf_norm(*(model if plant.is_discrete else cayley(*model, alpha))).upper)
+
+
+def _deviation_without_filter(fault_map: FaultMap) -> float:
+    """Return the root mean square of what the reference model makes of white faults; infinite where these pass."""
+    a, b, c, d = reduce(in_series, fault_map.setting.models)
+    if d.any():
+        return math.inf
+    return float(np.sqrt(max(np.trace(c @ continuous_lyapunov(a, -b @ b.T) @ c.T), 0.0))) if len(a) else 0.0
+
+
+def _no_filter(rows: int, outputs: int) -> Model:
+    """Return the filter whose estimate is zero."""
+    return np.zeros((0, 0)), np.zeros((0, outputs)), np.zeros((rows, 0)), np.zeros((rows, outputs))
 
 
 def on_plant(plant: DescriptorSystem, fault_map: FaultMap, weights: Any) -> FaultMap:

@@ -33,6 +33,7 @@ from obsynth.methods.optimal_filter.lasting_modes import (
 )
 from obsynth.methods.optimal_filter.late_outputs import shows_later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
+from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order
 from obsynth.methods.optimal_filter.reference import plain
@@ -272,7 +273,7 @@ def _of_low_order(
     """
     best: tuple[Designed, Followed, LinearObserver] | None = None
     for filter_ in filters_of_order(plant, chosen, limit, full, norm):
-        realised = _of_at_most(plant, filter_, limit)
+        realised = _of_at_most(plant, filter_, limit, norm)
         gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
         if realised is not None and gain < (math.inf if best is None else best[0].gain):
             best = filter_._replace(gain=gain), *realised
@@ -284,10 +285,12 @@ def _of_low_order(
     )
 
 
-def _of_at_most(plant: DescriptorSystem, chosen: Designed, limit: int) -> tuple[Followed, LinearObserver] | None:
+def _of_at_most(
+    plant: DescriptorSystem, chosen: Designed, limit: int, norm: str
+) -> tuple[Followed, LinearObserver] | None:
     """Return a filter's realisation; ``None`` where it has more states, or no longer the fault map."""
     try:
-        follower, observer, missed = _realised(plant, chosen)
+        follower, observer, missed = _realised(plant, chosen, norm)
     except SolverError:
         return None
     return (follower, observer) if observer.order <= limit and missed <= EXACT_SHARE else None
@@ -313,7 +316,7 @@ def _with_enough_noise(
     best: tuple[float, tuple[Designed, Followed, LinearObserver]] | None = None
     while True:
         try:
-            follower, observer, missed = _realised(plant, chosen)
+            follower, observer, missed = _realised(plant, chosen, norm)
             exact = chosen.fault_map.exact and bool(more)
             missed = missed if exact else 0.0
             # Noise that carries none, beside undriven modes, would count in the mean square of this plant.
@@ -348,7 +351,7 @@ def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: Followed, o
     return abs(own - chosen.gain) / chosen.gain if np.isfinite(own) else math.inf
 
 
-def _realised(plant: DescriptorSystem, chosen: Designed) -> tuple[Followed, LinearObserver, float]:
+def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Followed, LinearObserver, float]:
     """Return a filter's realisation, and by which share it misses its fault map."""
     problem, fault_map = chosen.problem, chosen.fault_map
     if problem.shift and shows_later_inputs(plant, chosen.filter):
@@ -360,7 +363,11 @@ def _realised(plant: DescriptorSystem, chosen: Designed) -> tuple[Followed, Line
     ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
     # One of few states may follow the plant by states that y does not reach.
     ways += [chosen.filter] if chosen.least is not None else []
+    white = norm == "h2" and not plant.is_discrete
+    if white:
+        ways = without_white_noise(plant, fault_map, ways)
     follower = followed(plant, ways, problem.window + problem.shift)
+    follower = with_digits_of(plant, follower) if white else follower
     rows = len(follower.C)
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)

@@ -1,0 +1,81 @@
+"""What a filter of continuous time passes at once, so that no white noise passes to the error but by rounding.
+
+Of signals of ever higher frequency an output shows ``N v``, v all that drives the plant, and the error of an estimate
+``D y`` is ``(D N - M) v``, M the reference model at infinity.  A design has ``D N = M`` but for rounding, beside which
+D itself may be small: white noise then has no finite mean square.  The nearest D with ``D N = M`` is taken instead, and
+for T0, with ``T0 E = 0`` and ``C T E + D C = T0 A``, the one that has the digits of D.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import numpy as np
+import scipy.linalg
+
+from obsynth.methods.optimal_filter.fault_maps import FaultMap
+from obsynth.methods.optimal_filter.realisation import Followed
+from obsynth.methods.optimal_filter.weights import in_series
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.plant_units import PlantUnits
+
+#: Corrections, each by what the last one left: a small D keeps its digits.
+CORRECTIONS = 3
+
+
+def without_white_noise(plant: DescriptorSystem, fault_map: FaultMap, filters: list[Model]) -> list[Model]:
+    """Return filters, from y in the plant's units, that pass at once what their fault map passes, and no more.
+
+    ``plant``: continuous, with the disturbances that are decoupled.  Where its index is 2 or more they are returned as
+    they are.
+    """
+    driven = fault_map.driven(plant)
+    if structure_of(driven).index not in (0, 1):
+        return filters
+    units = PlantUnits.of(plant).rounded().outputs
+    faults, disturbances, noise = _shown_at_once(driven)
+    noise = noise[:, : noise.shape[1] - fault_map.undriven]
+    shown = units[:, None] * np.hstack([faults, disturbances, noise])
+    sizes = np.linalg.norm(shown, axis=0)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    weights, reference = fault_map.weights, fault_map.reference
+    models = [model for model in (None if weights is None else weights.faults, reference) if model is not None]
+    wanted = reduce(in_series, models)[3]
+    wanted = np.hstack([wanted, np.zeros((len(wanted), shown.shape[1] - wanted.shape[1]))]) / sizes
+    inverse = np.linalg.pinv(shown / sizes, rcond=RANK_TOLERANCE)
+    return [(a, b, c, _corrected(d / units, shown / sizes, wanted, inverse) * units) for a, b, c, d in filters]
+
+
+def _shown_at_once(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what outputs show of faults, disturbances and noise of infinite frequency; the index is at most 1."""
+    answered = plant.C @ _answer(plant)
+    ways = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
+    faults, disturbances, noise = (through - answered @ driven for driven, through in ways)
+    return faults, disturbances, noise
+
+
+def with_digits_of(plant: DescriptorSystem, follower: Followed) -> Followed:
+    """Return a filter with the T0 that follows from what it passes at once; ``plant``: of any index."""
+    if follower.lag or structure_of(plant).index != 1:
+        return follower
+    return follower._replace(T0=follower.D @ plant.C @ _answer(plant))
+
+
+def _answer(plant: DescriptorSystem) -> FloatArray:
+    """Return ``X = R (L A R)^-1 L``, L and R the kernels of E: ``-X g`` is what g does to the states at once."""
+    units = PlantUnits.of(plant).rounded()
+    equations, states = units.equations[:, None], units.states
+    e, a = equations * plant.E * states, equations * plant.A * states
+    left, right = scipy.linalg.null_space(e.T, rcond=RANK_TOLERANCE).T, scipy.linalg.null_space(e, rcond=RANK_TOLERANCE)
+    answer = (states[:, None] * right) @ np.linalg.solve(left @ a @ right, left) * units.equations
+    return np.asarray(answer, dtype=np.float64)
+
+
+def _corrected(d: FloatArray, shown: FloatArray, wanted: FloatArray, inverse: FloatArray) -> FloatArray:
+    for _ in range(CORRECTIONS):
+        d = d - (d @ shown - wanted) @ inverse
+    return d
