@@ -46,7 +46,7 @@ def without_white_noise(plant: DescriptorSystem, fault_map: FaultMap, filters: l
     models = [model for model in (None if weights is None else weights.faults, reference) if model is not None]
     wanted = reduce(in_series, models)[3]
     wanted = np.hstack([wanted, np.zeros((len(wanted), shown.shape[1] - wanted.shape[1]))]) / sizes
-    inverse = np.linalg.pinv(shown / sizes, rcond=RANK_TOLERANCE)
+    inverse = np.asarray(np.linalg.pinv(shown / sizes, rcond=RANK_TOLERANCE), dtype=np.float64)
     return [(a, b, c, _corrected(d / units, shown / sizes, wanted, inverse) * units) for a, b, c, d in filters]
 
 
