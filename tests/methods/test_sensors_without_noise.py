@@ -195,3 +195,32 @@ def test_outputs_that_are_read_at_once_by_rounding_pass_no_white_noise() -> None
     assert claims["least_deviation"] == 0.0
     assert claims["deviation"] <= 1e-3
     assert design.report.passed
+
+
+def test_outputs_whose_algebraic_parts_cancel_in_the_filter_pass_no_white_noise() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 0.0, 1.0]),
+        A=[[-0.5, -0.5, -1.5], [0.0, -1.0, 1.5], [-1.0, -1.5, -1.0]],
+        Bf=[[-1.0, 1.0], [-1.0, 1.0], [1.5, -1.0]],
+        Bw=[[0.0, 0.0, 0.5], [-1.0, 0.0, 0.0], [-1.5, -2.0, 1.0]],
+        C=[[-0.5, 1.0, -0.5], [0.5, 1.5, 0.0]],
+        dt=0.0,
+    )
+    design = obsynth.optimal_filter(plant, norm="h2", exact=False, reference={"bandwidth": 2.0})
+    assert design.report.passed
+    assert design.certificate.claims["deviation"] == pytest.approx(1.22255095, rel=1e-8)
+
+
+def test_a_least_mean_square_that_is_rounding_is_zero() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 0.0, 1.0]),
+        A=[[-1.5, -1.5, -0.5], [-0.5, -1.0, 0.0], [-2.0, -0.5, -1.0]],
+        Bf=[[-0.5], [1.0], [1.5]],
+        Bw=[[1.0], [-1.0], [0.5]],
+        C=[[0.5, 1.0, 0.5], [-1.0, 1.0, 1.0], [1.5, -0.5, -2.0]],
+        Dw=[[0.0], [1.0], [0.0]],
+        dt=0.0,
+    )
+    claims = obsynth.optimal_filter(plant, norm="h2", reference={"bandwidth": 1.0, "order": 2}).certificate.claims
+    assert claims["least_deviation"] == 0.0
+    assert claims["deviation"] < 1e-6

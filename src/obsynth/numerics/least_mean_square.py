@@ -37,6 +37,8 @@ NEAR_THE_LEAST = 1.01
 NEARLY_ZERO = 1e-3
 #: Below this share of that of the filter the least one is rounding: the root of that of a covariance.
 ROUNDING_SHARE = 1e-5
+#: So is one below this share of what w drives the states to: some roots of the precision of double numbers.
+ROUNDED_ROOT = 1e-7
 
 
 class ContinuousFilter(NamedTuple):
@@ -243,7 +245,8 @@ def _least(measured: _Measured, wanted: FloatArray) -> float:
     while (split := _split(measured.of_rows(measured.shows()))) is not None:
         measured, wanted = split.rest, wanted @ split.N
     covariance = measured.of_rows(measured.shows()).covariance()
-    return float(np.sqrt(max(np.trace(wanted @ covariance @ wanted.T), 0.0)))
+    own = float(np.sqrt(max(np.trace(wanted @ covariance @ wanted.T), 0.0)))
+    return own if own > ROUNDED_ROOT * float(np.linalg.norm(wanted)) * measured.reach else 0.0
 
 
 def _split(measured: _Measured) -> _Split | None:

@@ -18,13 +18,16 @@ from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.plant_units import PlantUnits
 
 #: Corrections, each by what the last one left: a small D keeps its digits.
 CORRECTIONS = 3
+#: Entries of D below this share of the largest of their row are rounding of the corrections: what they leave is less
+#: than what verification takes for the rounding of a row, 1e4 units in its last place.
+ROUNDED_SHARE = 1e-13
 
 
 def without_white_noise(plant: DescriptorSystem, fault_map: FaultMap, filters: list[Model]) -> list[Model]:
@@ -62,7 +65,9 @@ def with_digits_of(plant: DescriptorSystem, follower: Followed) -> Followed:
     """Return a filter with the T0 that follows from what it passes at once; ``plant``: of any index."""
     if follower.lag or structure_of(plant).index != 1:
         return follower
-    return follower._replace(T0=follower.D @ plant.C @ _answer(plant))
+    answer = _answer(plant)
+    t0, terms = follower.D @ plant.C @ answer, np.abs(follower.D) @ np.abs(plant.C) @ np.abs(answer)
+    return follower._replace(T0=np.where(np.abs(t0) > CANCELLATION_TOLERANCE * terms, t0, 0.0))
 
 
 def _answer(plant: DescriptorSystem) -> FloatArray:
@@ -78,4 +83,4 @@ def _answer(plant: DescriptorSystem) -> FloatArray:
 def _corrected(d: FloatArray, shown: FloatArray, wanted: FloatArray, inverse: FloatArray) -> FloatArray:
     for _ in range(CORRECTIONS):
         d = d - (d @ shown - wanted) @ inverse
-    return d
+    return np.where(np.abs(d) > ROUNDED_SHARE * np.max(np.abs(d), axis=1, initial=0.0)[:, None], d, 0.0)
