@@ -128,3 +128,31 @@ def test_a_fast_zero_that_a_lag_hardly_shows_is_not_taken_for_one_that_it_cancel
     )
     with pytest.raises(obsynth.PreconditionError, match="zero that is not strictly stable"):
         obsynth.optimal_filter(plant)
+
+
+def test_a_long_delay_leaves_no_states_that_are_reached_by_rounding_only() -> None:
+    """The filter had 21 states, for 12 that respond, and its gain was proved to four digits only."""
+    rng = np.random.default_rng([47, 3, 14])
+    rng.integers(1, 5), rng.integers(2, 4), rng.integers(1, 3), rng.random()
+    modes = rng.standard_normal((3, 3))
+    modes *= 0.8 / max(abs(np.linalg.eigvals(modes)))
+    e, a = block_diag(np.eye(3), np.eye(3, k=1)), block_diag(modes, np.eye(3))
+    left, right = rng.standard_normal((2, 6, 6))
+    c, fault = rng.standard_normal((2, 6)), rng.standard_normal((6, 1))
+    design = obsynth.optimal_filter(
+        obsynth.DescriptorSystem(
+            E=left @ e @ right, A=left @ a @ right, C=c, Bf=fault, dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1}
+        ),
+        delay=5,
+    )
+    assert design.report.passed
+    assert design.observer.order <= 14
+    assert design.gain == pytest.approx(0.04384642, rel=1e-6)
+    assert design.gain < design.least * (1 + 1e-6)
+
+
+def test_modes_that_grow_and_that_no_input_drives_are_followed_where_outputs_are_of_high_index() -> None:
+    design = obsynth.optimal_filter(scrambled(8, 3))
+    assert design.report.passed
+    assert "A mode of the plant does not decay" in design.notes[-1]
+    assert 0.05 * (1.0 - 1e-8) < design.least <= design.gain < design.least * (1 + 1e-6)

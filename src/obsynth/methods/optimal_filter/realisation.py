@@ -90,6 +90,8 @@ def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list
     minimal_ones = [minimal(filter_, discrete=discrete)]
     if discrete:
         minimal_ones.append(_without_small_responses(filter_))
+        # Chains of delays that hardly respond may keep many states that are reached by rounding only.
+        minimal_ones.sort(key=lambda one: len(one[0]))
         a, b, c, d = filter_
         linked = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
         minimal_ones.append(_balanced((a[np.ix_(linked, linked)], b[linked], c[:, linked], d)))

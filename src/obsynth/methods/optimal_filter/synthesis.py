@@ -70,7 +70,8 @@ LASTING_NOTE = (
 )
 LATE_NOTE = (
     "Outputs of this plant show inputs of later samples (its index is 2 or more): this filter reads each output "
-    "{} late. The least gain is that of all causal filters."
+    "{} late. The least gain is that of all causal filters, also of those that read each output at once: a gap between "
+    "both is from that."
 )
 #: A filter forgets modes that last as fast as its deviation is at most this much above the least one.
 FORGETTING_ROOM = 1.01
@@ -90,10 +91,17 @@ def synthesise(plant: DescriptorSystem, options: OptimalFilterMethod, *, progres
         progress("building the realisation and its certificate")
         return _made(plant, options, curve, chosen)
     except (PreconditionError, SolverError):
-        made = _with_late_outputs(plant, options)
+        lasts = with_lasting_modes_driven(plant) is not plant
+        try:
+            made = _with_late_outputs(plant, options)
+        except SolverError:
+            # Read late or not, an undriven mode that grows is in the errors of a filter of this plant.
+            if not lasts:
+                raise
+            made = None
         if made is not None:
             return made
-        if with_lasting_modes_driven(plant) is plant:
+        if not lasts:
             raise
     progress("searching the least gain with noise on modes that last")
     return _with_every_start(plant, options) if options.norm == "h2" else _with_lasting_modes(plant, options)
