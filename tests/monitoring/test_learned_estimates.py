@@ -25,8 +25,8 @@ from obsynth.monitoring.thresholds.learned_levels import (
     rows_needed,
 )
 from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
-from obsynth.monitoring.thresholds.learning import learned_sizes
 from obsynth.monitoring.thresholds.monitor import NOT_DISTINGUISHED
+from obsynth.monitoring.thresholds.normal_output import learned_sizes
 from obsynth.monitoring.thresholds.parameter_scores import (
     Scores,
     before_any,
