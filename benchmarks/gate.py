@@ -1,7 +1,9 @@
 """Twelve cases, each as a ratio to an anchor measured in the same run: what has become slow is seen at once.
 
 ``python benchmarks/gate.py`` takes five seeds from the commit's hash (``--commit HASH`` where there is no repository),
-prints a table, and ends with exit code 1 where a ratio is more than twice its bound in ``gate_bounds.json``.
+prints a table, and ends with exit code 1 where a ratio is too large for its bound in ``gate_bounds.json``. Of random
+filters the median of the seeds is judged, at 1.5 times its bound, and the worst at 5 times: the worst of five varies by
+three from commit to commit, the median by a quarter. Other cases have few seeds or none, and the worst is judged, at 2.
 ``--write`` takes ten seeds and writes the table into ``benchmarks/README.md``; ``--small`` runs one small instance of
 each case.
 Processor time (user and system) on one BLAS thread; memory is the peak of the process until the case was done.
@@ -45,8 +47,12 @@ from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem
 HERE = Path(__file__).resolve().parent
 ROOT, BOUNDS = HERE.parent, HERE / "gate_bounds.json"
 SEEDS, SEEDS_OF_THE_TABLE = 5, 10
-#: Fails where a ratio is above its bound by more than this factor.
+#: Fails where the worst ratio is above its bound by more than this factor,
 ALLOWED = 2.0
+#: and, where there are seeds enough for a median, where the median is above its bound by more than the first of these,
+#: or the worst by more than the second.
+ALLOWED_OF_MEDIAN, ALLOWED_OF_WORST = 1.5, 5.0
+SEEDS_OF_A_MEDIAN = 5
 #: So many times everything is measured again where a ratio is too large.
 MEASURED_AGAIN = 2
 #: The table in the README stands between these lines.
@@ -64,8 +70,20 @@ class Case:
 
     @property
     def ratio(self) -> float:
-        """Worst of ours over the anchor."""
-        return max(self.ours) / self.anchored
+        """What the bound holds for, over the anchor: the median of enough seeds, else the worst."""
+        return (statistics.median(self.ours) if self.of_median else max(self.ours)) / self.anchored
+
+    @property
+    def of_median(self) -> bool:
+        """Whether the bound holds for the median."""
+        return len(self.ours) >= SEEDS_OF_A_MEDIAN
+
+    @property
+    def excess(self) -> float:
+        """What is judged, in units of what is allowed at a bound of 1: too large above the bound."""
+        if not self.of_median:
+            return self.ratio / ALLOWED
+        return max(self.ratio / ALLOWED_OF_MEDIAN, max(self.ours) / self.anchored / ALLOWED_OF_WORST)
 
 
 def seconds(action: Callable[[], object], runs: int = 1) -> float:
@@ -115,7 +133,7 @@ def filters(seeds: Sequence[int], *, small: bool) -> Iterator[Case]:
     obsynth.fault_estimation_filter(random_plant(nx, "brief", 0))  # imports
     for family in FAMILIES:
         ours = [design_seconds(nx, family, seed) for seed in seeds]
-        yield Case(f"filter, nx {nx}, {family}", "cvxpy and Clarabel", ours, direct(nx, family, seeds[:3]))
+        yield Case(f"filter, nx {nx}, {family}", "cvxpy and Clarabel", ours, direct(nx, family, seeds))
     nx = 10 if small else 32
     # By default both weights are tried, and the better one is shipped.
     for weight, name in (("paper", "paper's W"), (None, "both W")):
@@ -270,7 +288,7 @@ def seeds_of(text: str, count: int) -> list[int]:
 
 
 def main() -> int:
-    """Print the table; return 1 where a bound is missed by more than a factor of two."""
+    """Print the table; return 1 where a case is too slow for its bound."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--commit", help="hash that gives the seeds (default: that of the repository)")
     parser.add_argument("--write", action="store_true", help="ten seeds; the table goes into benchmarks/README.md")
@@ -278,7 +296,7 @@ def main() -> int:
     options = parser.parse_args()
     count = 1 if options.small else SEEDS_OF_THE_TABLE if options.write else SEEDS
     bounds = json.loads(BOUNDS.read_text())
-    lines = ["| case | ours, s: median, worst | anchor | anchor, s | worst / anchor | bound | MB so far |",
+    lines = ["| case | ours, s: median, worst | anchor | anchor, s | median or worst / anchor | bound | MB so far |",
              "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     print("\n".join(lines), flush=True)
     missed: dict[str, str] = {}
@@ -292,32 +310,34 @@ def main() -> int:
         print(lines[-1], flush=True)
         if bound is None and not options.small:
             missed[case.name] = f"no bound in {BOUNDS.name}"
-        elif bound is not None and not options.small and case.ratio > ALLOWED * bound:
-            missed[case.name] = f"{case.ratio:.3g} times {case.anchor}, more than {ALLOWED:g} times {bound}"
+        elif bound is not None and not options.small and case.excess > bound:
+            worst = max(case.ours) / case.anchored
+            missed[case.name] = f"{case.ratio:.3g} (worst {worst:.3g}) times {case.anchor}, too much for {bound}"
     if options.write:
         write(lines, BEGIN, END)
     for _ in range(MEASURED_AGAIN):
         if not missed.keys() & bounds.keys():
             break
-        again = ratios_of_a_fresh_process(seeds)
-        print("measured again:", ", ".join(f"{name} {again[name]:.3g}" for name in missed if name in again), flush=True)
+        again = measured_in_a_fresh_process(seeds)
+        print("measured again:", ", ".join(f"{name} {again[name].ratio:.3g}" for name in missed if name in again))
         missed = {
-            name: text for name, text in missed.items() if again.get(name, np.inf) > ALLOWED * bounds.get(name, 0.0)
-        }
+            name: text for name, text in missed.items()
+            if name not in again or name not in bounds or again[name].excess > bounds[name]
+        }  # fmt: skip
     for name, text in missed.items():
         print(f"MISSED: {name}: {text}", file=sys.stderr)
     return 1 if missed else 0
 
 
-def ratios(seeds: Sequence[int]) -> dict[str, float]:
-    """Return the ratio of each case."""
-    return {case.name: case.ratio for case, _ in cases(seeds, small=False)}
+def measured(seeds: Sequence[int]) -> dict[str, Case]:
+    """Return each case by its name."""
+    return {case.name: case for case, _ in cases(seeds, small=False)}
 
 
-def ratios_of_a_fresh_process(seeds: Sequence[int]) -> dict[str, float]:
-    """Return the ratio of each case, measured where nothing is remembered."""
+def measured_in_a_fresh_process(seeds: Sequence[int]) -> dict[str, Case]:
+    """Return each case by its name, measured where nothing is remembered."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
-        return process.submit(ratios, seeds).result()
+        return process.submit(measured, seeds).result()
 
 
 def write(lines: Sequence[str], begin: str, end: str) -> None:
