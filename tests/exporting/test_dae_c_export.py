@@ -16,8 +16,8 @@ from test_dae_observer import matrices
 import obsynth
 from obsynth import SpecError, simulate_dae
 from obsynth.cli.main import main
+from obsynth.observers.changed_options import changed
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.running import changed
 from obsynth.plants.dae_functions import Compiled
 from obsynth.specs.loader import load_spec
 

@@ -14,7 +14,7 @@ from test_validate import designed
 
 import obsynth
 from obsynth import SpecError, dae_adaptive_observer, simulate_dae
-from obsynth.observers.running import changed
+from obsynth.observers.changed_options import changed
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 OPTIONS = {

@@ -15,7 +15,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts
-from obsynth.observers.running import changed
+from obsynth.observers.changed_options import changed
 
 LINEAR = obsynth.DescriptorSystem(
     A=[[0.9]], B=[[0.1]], C=[[1.0]], Bf=[[0.1]], dt=1.0, input_names=["u"], output_names=["y"], fault_names=["p"]

@@ -17,7 +17,8 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import ExtendedBall
 from obsynth.proofs.linear_equations import enclosed_solution
 from obsynth.proofs.products import as_ball
-from obsynth.verification.constant_faults import ConstantFaults, constant_fault_row
+from obsynth.verification.constant_faults import constant_fault_row
+from obsynth.verification.settled_faults import ConstantFaults
 
 ROW = "constant fault"
 #: Methods, their time, and options by which they are as fast as a sample, or a second.

@@ -31,9 +31,9 @@ from obsynth.exporting.dae_float import float_error
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.changed_options import as_run, rule_of_outliers
 from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.nonlinear.c_code import observer_code, observer_struct
-from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.plants.dae import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest

@@ -17,12 +17,13 @@ from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
-from obsynth.verification.constant_faults import STEADY_ERROR, ConstantFaults, constant_fault_row
+from obsynth.verification.constant_faults import STEADY_ERROR, constant_fault_row
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.over_tolerances.rows import tolerance_rows
 from obsynth.verification.plant import condition_rows, derivation_rows, stored_twice_rows
 from obsynth.verification.platform import platform_rows
 from obsynth.verification.requested_limits import requested_rows
+from obsynth.verification.settled_faults import ConstantFaults
 from obsynth.verification.stored_numbers import stored_number_rows
 
 #: The package whose methods prove decay by rows of their own, which its tests break one by one.

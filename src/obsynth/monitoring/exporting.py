@@ -101,34 +101,55 @@ class LearnedMonitorInC:
 
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor."""
+        learned = self.learned
+        faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}
+        faults |= {f"fault {name}": i for i, name in enumerate(self.fault_names)}
+        listed = ", ".join(f"{name} = {value}" for name, value in self._sizes().items())
+        lines = [
+            f"enum {{ {listed} }};",
+            f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
+            f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
+            f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
+            *(line for name, table in self._tables().items() for line in table_lines(name, filled_table(table))),
+            *integer_table("monitor_longest", self.longest()),
+            *integer_table("monitor_ages", AGES),
+            *integer_table("monitor_places", [self.columns.index(name) for name in learned.columns]),
+            *integer_table("monitor_seldom", [int(name in learned.seldom) for name in self.columns]),
+            *integer_table("monitor_told", [faults.get(name, -1) for name in learned.statistics.signature_names]),
+        ]
+        return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
+
+    def _sizes(self) -> dict[str, int]:
+        """Return the sizes of the tables, by their names in C."""
         learned, model = self.learned, self.learned.statistics.model
-        bands = learned.statistics.fault_bands
-        shapes, slopes = learned.statistics.responses()
-        order, shares, faults_watched = model.order, np.array(FORGETTING), len(learned.statistics.estimates)
-        straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
-        rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
-        powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
-        nothing = np.zeros(0)
-        middle, half = (nothing, nothing) if learned.ranges is None else learned.ranges.middle_and_half()
-        rates = None if learned.ranges is None else learned.ranges.rates
-        sizes = {
+        faults_watched = len(learned.statistics.estimates)
+        return {
             "CHANNELS": model.channels,
-            "ORDER": order,
+            "ORDER": model.order,
             "OLDEST": max(AGES),
             "AGES": len(AGES),
-            "MEANS": len(shares),
-            "SHAPES": len(shapes),
+            "MEANS": len(FORGETTING),
+            "SHAPES": len(learned.statistics.responses()[0]),
             "MONITOR_FAULTS": len(learned.scales),
             "MONITOR_ESTIMATES": faults_watched,
             "MONITOR_WIDTH": max(faults_watched, 1),
             "MONITOR_SETTLING": learned.settling,
             "MONITOR_OUTPUTS": self.outputs,
-            "MONITOR_INPUTS": len(middle),
+            "MONITOR_INPUTS": 0 if learned.ranges is None else len(learned.ranges.middle_and_half()[0]),
             "MONITOR_STATISTICS": len(learned.levels),
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
-        tables: dict[str, Any] = {
+
+    def _tables(self) -> dict[str, Any]:
+        """Return the numbers of the thresholds, by their names in C."""
+        learned, model = self.learned, self.learned.statistics.model
+        bands = learned.statistics.fault_bands
+        shares = np.array(FORGETTING)
+        nothing = np.zeros(0)
+        middle, half = (nothing, nothing) if learned.ranges is None else learned.ranges.middle_and_half()
+        rates = None if learned.ranges is None else learned.ranges.rates
+        return {
             "monitor_mean": model.mean[None],
             "monitor_offset": model.offset[None],
             "monitor_A": model.A.reshape(-1, model.channels),
@@ -137,12 +158,9 @@ class LearnedMonitorInC:
             "monitor_shares": shares[None],
             "monitor_sizes": ((2.0 - shares) / shares)[None],
             "monitor_levels": learned.levels[None],
-            "monitor_flat": straight[:, 0],
-            "monitor_slopes": slopes,
-            "monitor_early": (shapes - straight).reshape(-1, model.channels),
-            "monitor_roots": np.sqrt(1.0 / (np.maximum(powers, SMALLEST) * learned.statistics.levels_by_age)),
+            **self._step_responses(),
             "monitor_effects": learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age),
-            "monitor_bands": (np.zeros(faults_watched) if bands is None else bands)[None],
+            "monitor_bands": (np.zeros(len(learned.statistics.estimates)) if bands is None else bands)[None],
             "monitor_centres": learned.centres[None],
             "monitor_scales": learned.scales[None],
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,
@@ -151,22 +169,21 @@ class LearnedMonitorInC:
             "monitor_rates": np.ones((len(middle), len(learned.levels))) if rates is None else rates,
             "monitor_innovation": np.array([[learned.innovation]]),
         }
-        faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}
-        faults |= {f"fault {name}": i for i, name in enumerate(self.fault_names)}
-        listed = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-        lines = [
-            f"enum {{ {listed} }};",
-            f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
-            f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
-            f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
-            *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
-            *integer_table("monitor_longest", self.longest()),
-            *integer_table("monitor_ages", AGES),
-            *integer_table("monitor_places", [self.columns.index(name) for name in learned.columns]),
-            *integer_table("monitor_seldom", [int(name in learned.seldom) for name in self.columns]),
-            *integer_table("monitor_told", [faults.get(name, -1) for name in learned.statistics.signature_names]),
-        ]
-        return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
+
+    def _step_responses(self) -> dict[str, FloatArray]:
+        """Return what steps do to whitened residuals: a straight line, what the first rows differ from it by, and the
+        inverse lengths of all rows up to each age."""
+        statistics, order = self.learned.statistics, self.learned.statistics.model.order
+        shapes, slopes = statistics.responses()
+        straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
+        rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
+        powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
+        return {
+            "monitor_flat": straight[:, 0],
+            "monitor_slopes": slopes,
+            "monitor_early": (shapes - straight).reshape(-1, statistics.model.channels),
+            "monitor_roots": np.sqrt(1.0 / (np.maximum(powers, SMALLEST) * statistics.levels_by_age)),
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeAlias, TypeVar
 
@@ -24,8 +24,6 @@ State = TypeVar("State")
 
 Row = TypeVar("Row")
 
-
-Robust = TypeVar("Robust", bound=Any)
 
 #: Takes the states before and after a sample, what is known at it, and its inputs.
 AfterStep: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
@@ -256,32 +254,3 @@ def named_estimates(observer: StepObserver, *, states: FloatArray, faults: Float
         observer.fault_delays,
         **arrays,
     )
-
-
-def changed(observer: Robust, **options: Any) -> Robust:
-    """Return the observer with other options; the steps of a nonlinear one are built once."""
-    other = replace(observer, **options)
-    if "steps" in vars(observer):
-        # What these options do stands outside of the compiled steps.
-        vars(other)["steps"] = type(observer.steps)(other, observer.steps.graph)
-    return other
-
-
-def as_run(observer: Robust, outliers: str | None = None, *, stated: str | None = None) -> Robust:
-    """Return the observer as a run on data has it: outliers are left out where neither ``outliers``, nor what is
-    ``stated`` in the options of its design, says anything of them."""
-    wanted = outliers or stated or ("gate" if observer.outliers == "none" else observer.outliers)
-    return observer if wanted == observer.outliers else changed(observer, outliers=wanted)
-
-
-def rule_of_outliers(design: Any) -> str | None:
-    """Return what the options of a design state about outliers, as far as its observer still has that rule."""
-    stated: str | None = design.options.get("outliers")
-    return stated if stated == design.observer.outliers else None
-
-
-def plain_recursion(observer: Robust) -> Robust:
-    """Return the recursion itself: every sensor at each row, at once, taken as it is, and no bounds on states."""
-    if observer.outliers == "none" and not observer.sensors and observer.state_bounds is None:
-        return observer
-    return changed(observer, outliers="none", sensors=None, state_bounds=None)

@@ -51,6 +51,10 @@ class Vertex(Protocol):
         """Return M ``(n, n)``, B ``(n, p)``, Cz ``(q, n)`` and Dz ``(q, p)``."""
 
 
+#: What is proved: vertices, or one block with the slopes of a plant.
+Proved = Sequence[Vertex] | SlopeBlock
+
+
 @dataclass(frozen=True, eq=False)
 class Witness:
     """Lyapunov matrices from which the inequalities of a polytope are recomputed.
@@ -167,10 +171,6 @@ def pairs_of(count: int, steps: float | None) -> list[Pair]:
 
     corners = [(0.0, 0.0), (0.0, reach), (1.0 - reach, 1.0), (1.0, 1.0), (1.0, 1.0 - reach), (reach, 0.0)]
     return [(weights(now), weights(then)) for now, then in dict.fromkeys(corners)]
-
-
-#: What is proved: vertices, or one block with the slopes of a plant.
-Proved = Sequence[Vertex] | SlopeBlock
 
 
 def prove_gain(vertices: Proved, witness: Witness, gain: float, *, discrete: bool, ball: float = 0.0) -> VertexProof:

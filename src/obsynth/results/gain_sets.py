@@ -50,6 +50,18 @@ HOW_WRITTEN = "Write one with obsynth design --system SPEC --output FILE, or Obs
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
 
+#: The type of every part that a gain set has, in words and as a test.
+_TYPES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("name", "method"), ("a text", lambda value: isinstance(value, str))),
+    **dict.fromkeys(
+        ("plant", "options", "observer", "solver", "report"), ("a mapping", lambda value: isinstance(value, dict))
+    ),
+    "gains": ("a mapping to arrays of numbers", lambda value: _is_mapping_to(value, _is_array)),
+    "certificate": ("matrices and claims that are numbers", lambda value: _is_certificate(value)),
+    "notes": ("a list of texts", lambda value: _is_texts(value)),
+    "recovery": ("maps with the names of states, or nothing", lambda value: value is None or _is_recovery(value)),
+}
+
 
 def written_for(gains: Path) -> str | None:
     """Return the digest of the place of the spec for which a gain set was written, `None` where it is not known."""
@@ -228,19 +240,6 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         source=source,
         input_delay=data.get("input_delay", 0),
     )
-
-
-#: The type of every part that a gain set has, in words and as a test.
-_TYPES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
-    **dict.fromkeys(("name", "method"), ("a text", lambda value: isinstance(value, str))),
-    **dict.fromkeys(
-        ("plant", "options", "observer", "solver", "report"), ("a mapping", lambda value: isinstance(value, dict))
-    ),
-    "gains": ("a mapping to arrays of numbers", lambda value: _is_mapping_to(value, _is_array)),
-    "certificate": ("matrices and claims that are numbers", lambda value: _is_certificate(value)),
-    "notes": ("a list of texts", lambda value: _is_texts(value)),
-    "recovery": ("maps with the names of states, or nothing", lambda value: value is None or _is_recovery(value)),
-}
 
 
 def _checked_parts(body: Any) -> dict[str, Any]:

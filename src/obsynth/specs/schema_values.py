@@ -47,6 +47,8 @@ Text = Annotated[str, Field(min_length=1)]
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
+Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
+
 #: By what a number in each unit is multiplied, then divided, for seconds: 1.1 ms are 0.0011 s to the last digit.
 _SECONDS = {
     "us": (1.0, 1e6),
@@ -74,8 +76,6 @@ def in_seconds(value: Any) -> Any:
 PositiveTime = Annotated[Positive, BeforeValidator(in_seconds)]
 
 Time = Annotated[NonNegative, BeforeValidator(in_seconds)]
-
-Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
 
 
 def _has_decimal_commas(rows: list[Any]) -> bool:

@@ -16,6 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import RANK_TOLERANCE, SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch
+from obsynth.observers.changed_options import plain_recursion
 from obsynth.observers.nonlinear.building import (
     FEWEST_STEPS,
     OPTIONS,
@@ -25,7 +26,6 @@ from obsynth.observers.nonlinear.building import (
     resolved_options,
 )
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.running import plain_recursion
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite

@@ -9,6 +9,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import require_all
 from obsynth.methods.dae_adaptive_observer.method import DaeAdaptiveObserver
 from obsynth.methods.method import Synthesis
+from obsynth.observers.changed_options import plain_recursion
 from obsynth.observers.nonlinear.building import (
     LARGEST_TURN,
     NOMINAL_STEPS,
@@ -19,7 +20,6 @@ from obsynth.observers.nonlinear.building import (
     resolved_options,
 )
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.running import plain_recursion
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.implicit_step import PROJECTION_NOTICE
 from obsynth.plants.noise import offset_state

@@ -15,7 +15,11 @@ import numpy as np
 from obsynth.analysis.dae_structure import identifiability
 from obsynth.analysis.existence.moussaali_dae import NOMINAL_SAMPLES
 from obsynth.errors import SolverError
-from obsynth.monitoring.calibration.diagnostics import SIGNIFICANT, mean_off, whiteness
+from obsynth.monitoring.calibration.diagnostics import (
+    SIGNIFICANT,
+    mean_off,
+    whiteness,
+)
 from obsynth.monitoring.calibration.explanations import LEAST_EXPLANATION, regression_gain
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
@@ -23,7 +27,6 @@ from obsynth.monitoring.calibration.maximum import Objective
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem
-from obsynth.monitoring.calibration.reporting import COLOURED_SHARE, FIRST_AUTOCORRELATIONS
 from obsynth.monitoring.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel
@@ -53,6 +56,9 @@ _OFFSET_HIDES = (
 
 #: Wrong samples in a row at most, and how many after them must be where they are predicted.
 LONGEST_RUN, RETURNED = 5, 3
+
+#: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
+FIRST_AUTOCORRELATIONS, COLOURED_SHARE = (0.3, 0.98), 0.7
 
 
 def proposed_states(

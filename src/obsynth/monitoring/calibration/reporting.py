@@ -1,8 +1,7 @@
-"""The result of a calibration from a fit: tables by name, tests of the innovations, and sentences on both."""
+"""The result of a calibration from a fit: tables by name, and tests of the innovations."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,40 +13,25 @@ from obsynth.monitoring.calibration.diagnostics import (
     Whiteness,
     change_of_mean,
     consistency,
-    mean_off,
     whiteness,
 )
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.integration_error import IntegrationError
 from obsynth.monitoring.calibration.intervals import Side, covariance_of, quantile
-from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, listed_rows
+from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.monitoring.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.result import Calibration
-from obsynth.monitoring.calibration.simulation_error import Fit, SimulationError, unexplained
+from obsynth.monitoring.calibration.simulation_error import Fit, SimulationError
 from obsynth.monitoring.calibration.variance_names import variance_names
+from obsynth.monitoring.calibration.verdict import on_constants, on_innovations, on_log, on_misfits
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.calibrated_box import CalibratedBox
 from obsynth.plants.dae_functions import BUTCHER
 from obsynth.plants.noise import noise_state, noise_variance, offset_state
 
-#: Constants whose correlation exceeds this are named together.
-CORRELATED = 0.9
-
-#: A sensor's variance below this multiple of its quantisation's is reported.
-AT_QUANTISATION = 1.5
-
-#: A timing that is better by this many nats is reported, even where it is not taken.
-NOTED_NATS = 2.0
-
-#: A variance of a sensor above this share of what its signal has stands for the signal.
-SIGNAL_SHARE = 0.1
-
 #: A constant within this share of the bounds' width from one of them is at it.
 END_SHARE = 1e-6
-
-#: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
-FIRST_AUTOCORRELATIONS, COLOURED_SHARE = (0.3, 0.98), 0.7
 
 
 def reported(
@@ -66,9 +50,7 @@ def reported(
     covariance = result.information.covariance
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviations, deviations)
-    colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
-    change = change_of_mean(whitened)
-    nis = consistency(float(np.nansum(whitened**2)), int(np.isfinite(problem.y).sum()))
+    nis, colours, row = _tests_of_innovations(problem, whitened)
     box = _box(
         names, result, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
     )
@@ -77,50 +59,62 @@ def reported(
     q, r = variance_names(problem.noisy, problem.output_names)
     limits = zip((*q, *r), (*result.limited_Q, *result.limited_R), strict=True)
     limited = [name for name, weak in limits if weak]
-    row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, is_at_end in zip(problem.unknown, result.at_bounds, strict=True) if is_at_end)
-    verdict = [
+    verdict = (
         *problem.log.notes,
         *problem.plant.notes,
         *problem.notes,
-        *_fitted(problem, box, result, at_end, correlation, limited, Q, R),
-        *_misfits(problem, start, whitened, R),
-        *_checked(nis, colours, row, fit is None),
-        *_sentences_on_log(problem, R, losses, error),
-    ]
-    return Calibration(
-        box.nominal,
-        read_only(covariance),
-        read_only(correlation),
-        box,
-        result.information.undetermined,
-        Q,
-        R,
-        tuple(limited),
-        nis,
-        colours,
-        row,
-        problem.log.input_delay,
-        dict(losses),
-        dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)),
-        at_end,
-        problem.integration,
-        problem.substeps,
-        "innovations" if fit is not None else "simulation",
-        -result.value,
-        tuple(verdict),
-        read_only(whitened),
-        read_only(problem.y - result.innovations),
-        read_only(np.sqrt(result.variances)),
-        problem.log.described | {"digest": digest},
-        {name: problem.plant.units.get(name, "1") for name in names},
-        problem.output_names,
-        *_noise_model(problem, result, Q, R),
-        dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
-        getattr(problem.plant, "inner", problem.plant).equation_names,
-        _outlier_sizes(problem.log, np.sqrt(np.median(result.variances, axis=0))),
-        _fitted_offsets(problem, result),
+        *on_constants(problem, box, result, at_end, correlation, limited, Q, R),
+        *on_misfits(problem, start, whitened, R),
+        *on_innovations(nis, colours, row, fit is None),
+        *on_log(problem, R, losses, error),
     )
+    sensor_noise, offset, walks = _noise_model(problem, result, Q, R)
+    return Calibration(
+        nominal=box.nominal,
+        covariance=read_only(covariance),
+        correlation=read_only(correlation),
+        box=box,
+        undetermined=result.information.undetermined,
+        Q=Q,
+        R=R,
+        upper_limits=tuple(limited),
+        nis=nis,
+        whiteness=colours,
+        change=row,
+        input_delay=problem.log.input_delay,
+        timing=dict(losses),
+        quanta=dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)),
+        at_bounds=at_end,
+        integration=problem.integration,
+        substeps=problem.substeps,
+        method="innovations" if fit is not None else "simulation",
+        log_likelihood=-result.value,
+        verdict=verdict,
+        innovations=read_only(whitened),
+        predictions=read_only(problem.y - result.innovations),
+        deviations=read_only(np.sqrt(result.variances)),
+        log=problem.log.described | {"digest": digest},
+        units={name: problem.plant.units.get(name, "1") for name in names},
+        output_names=problem.output_names,
+        sensor_noise=sensor_noise,
+        offset=offset,
+        walks=walks,
+        initial_covariance=dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
+        own_equations=getattr(problem.plant, "inner", problem.plant).equation_names,
+        outlier_sizes=_outlier_sizes(problem.log, np.sqrt(np.median(result.variances, axis=0))),
+        found_offsets=_fitted_offsets(problem, result),
+    )
+
+
+def _tests_of_innovations(
+    problem: CalibrationProblem, whitened: FloatArray
+) -> tuple[Consistency, dict[str, Whiteness], int | None]:
+    """Return size and whiteness of innovations ``(n, ny)``, and the row of the log where their mean changes."""
+    nis = consistency(float(np.nansum(whitened**2)), int(np.isfinite(problem.y).sum()))
+    colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
+    change = change_of_mean(whitened)
+    return nis, colours, None if change is None else problem.log.rows[0] + change
 
 
 def _box(names: Sequence[str], fit: InnovationsFit, level: float, digest: str, *, stands: bool) -> CalibratedBox:
@@ -211,51 +205,6 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
     )
 
 
-def _fitted(
-    problem: CalibrationProblem,
-    box: CalibratedBox,
-    fit: InnovationsFit,
-    at_end: tuple[str, ...],
-    correlation: FloatArray,
-    limited: list[str],
-    Q: dict[str, float],
-    R: dict[str, float],
-) -> list[str]:
-    sentences = []
-    for direction in fit.information.undetermined:
-        listed = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
-        sentences.append(
-            f"This log does not determine the direction ({listed}), in widths of the bounds: excite it, state a prior, "
-            "or fix one of them."
-        )
-    sentences += [
-        f"The box of {name} is open on its {side} side: the bound limits it there, the log does not."
-        for name, side in box.open_sides
-    ]
-    sentences += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
-    free = [
-        i
-        for i, name in enumerate(problem.names)
-        if not any(name in direction for direction in fit.information.undetermined)
-    ]
-    sentences += [
-        f"{problem.unknown[i]} and {problem.unknown[j]} are correlated by {correlation[i, j]:+.2f}: their "
-        "combination is known better than either."
-        for i, j in itertools.combinations(free, 2)
-        if abs(correlation[i, j]) > CORRELATED
-    ]
-    q, r = variance_names(tuple(Q), tuple(R))
-    values = dict(zip((*q, *r), (*Q.values(), *R.values()), strict=True))
-    if not box.stands:
-        sentences.append(
-            f"The box is not valid: its {100 * box.level:g} % are those of white innovations, which these are not."
-        )
-    return sentences + [
-        f"The variance of {name} cannot be distinguished from zero: its upper limit {values[name]:.3g} is used."
-        for name in limited
-    ]
-
-
 def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]:
     """Return how far off an outlier of each output is at least, for innovations of ``deviations (ny,)``.
 
@@ -268,85 +217,3 @@ def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]
             usual, least, share = OUTLYING * float(deviation), float(sizes.min()), 1.0 / (len(sizes) + 1)
             by_output[name] = usual**share * least ** (1.0 - share)
     return by_output
-
-
-def _misfits(problem: CalibrationProblem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
-    """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
-    sentences = []
-    for name in unexplained(problem, start.deviations):
-        signal = float(np.nanvar(problem.y[:, problem.output_names.index(name)]))
-        sentences.append(
-            f"The best simulation explains almost nothing of {name}: "
-            + (
-                "its sign, its unit or its equation is wrong, and its R is the variance of the signal itself."
-                if R[name] > SIGNAL_SHARE * signal
-                else "noise of the equations drives it more than the inputs do."
-            )
-        )
-    for name, column in zip(problem.output_names, whitened.T, strict=True):
-        mean = mean_off(column)
-        if mean:
-            sentences.append(
-                f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
-                "offset that the model lacks."
-            )
-        rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > OUTLYING)
-        if len(rows):
-            sentences.append(
-                f"Samples of {name} stand out by more than {OUTLYING:g} deviations (row {listed_rows(rows)}): "
-                "if they are outliers, mark them as missing."
-            )
-    return sentences
-
-
-def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
-    sentences = [
-        f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
-        f"{test.first:+.2f}): a signal that acts on {name} is not in the model."
-        for name, test in colours.items()
-        if test.probability < SIGNIFICANT
-    ]
-    if simulated and sentences:
-        sentences.append(
-            "The residuals of a simulation that are not white make boxes too small: use method='innovations'."
-        )
-    if not simulated and not nis.holds:
-        sentences.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
-    if row is not None:
-        sentences.append(
-            f"These rows are not homogeneous: the mean of the innovations changes at row {row}. If a fault "
-            "begins there, end the rows before it."
-        )
-    return sentences
-
-
-def _sentences_on_log(
-    problem: CalibrationProblem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
-) -> list[str]:
-    sentences, delay = list[str](), problem.log.input_delay
-    for name, step in zip(problem.output_names, problem.quanta, strict=True):
-        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
-            sentences.append(
-                f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is at least that of the "
-                "quantisation."
-            )
-    if delay and losses:
-        rows = "1 row" if delay == 1 else f"{delay} rows"
-        gained = losses[0] - losses[delay]
-        sentences.append(f"The inputs act {rows} later than the log states: better by {gained:.1f} nats.")
-    lost = losses.get(delay, 0.0)
-    if lost > NOTED_NATS:
-        least = min(losses, key=lambda rows: losses[rows])
-        sentences.append(
-            f"Inputs that act {least:+d} {'row' if abs(least) == 1 else 'rows'} later would be better by {lost:.1f} "
-            "nats: see input_delay."
-        )
-    if error is not None:
-        used = "Radau" if problem.integration == "radau" else "backward Euler"
-        movement = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
-        sentences.append(
-            f"A step of backward Euler has an error of at most {error.largest:.2g} deviations of "
-            f"{error.sensor}{movement}: "
-            f"{used} is used."
-        )
-    return sentences

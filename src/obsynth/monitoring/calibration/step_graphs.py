@@ -33,6 +33,9 @@ SOLVED_STEP = 1e-11
 #: Operations in one evaluation above which functions are compiled: a second or so, before a thousand evaluations.
 COMPILED_OPERATIONS = 200_000
 
+#: Libraries that are held: a calibration tries some twenty models of two each, and chooses one of them at last.
+HELD_LIBRARIES = 64
+
 
 def compiled(functions: Sequence[Any]) -> list[Any]:
     """Return the same functions as machine code; as they are where there is no compiler or it fails."""
@@ -50,10 +53,6 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
         )
     except (SpecError, RuntimeError):  # CasADi, of a folder from which nothing is loaded
         return list(functions)
-
-
-#: Libraries that are held: a calibration tries some twenty models of two each, and chooses one of them at last.
-HELD_LIBRARIES = 64
 
 
 @lru_cache(maxsize=HELD_LIBRARIES)

@@ -37,12 +37,12 @@ from obsynth.monitoring.calibration.walk_shares import (
 )
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.changed_options import changed
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.nonlinear.estimates import GatheredRows
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import changed
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign

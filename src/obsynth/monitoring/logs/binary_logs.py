@@ -54,6 +54,9 @@ LARGEST_SHIFT = 0.5
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
 _BEGINNINGS |= {".npz": b"PK\3\4", ".mat": b"MATLAB"}
 
+#: Returns the channels of a file: group, name and samples of each.
+_Channels: TypeAlias = "Callable[[Path], list[tuple[str, str, Any]]]"
+
 
 @contextmanager
 def read_by_package(path: Path) -> Iterator[None]:
@@ -320,9 +323,6 @@ def _cells_of(samples: Any) -> Any:
     if samples.dtype.kind == "S":
         return np.array([cell.decode("utf-8", "replace") for cell in samples], dtype=object)
     return np.asarray(samples, dtype=object if samples.dtype.kind == "U" else np.float64)
-
-
-_Channels: TypeAlias = "Callable[[Path], list[tuple[str, str, Any]]]"
 
 
 def _arrays(channels_of: _Channels, path: Path, signals: LogSignals, _: Stamps, rows: int) -> Iterator[pd.DataFrame]:

@@ -13,32 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.monitoring.alarms.events import NO_DECISION, SHELVED, AlarmEvent, AlarmLog
+from obsynth.monitoring.alarms.events import NO_DECISION, SHELVED, AlarmLog
 from obsynth.monitoring.logs.clock import STALE, Clock, StampError
-from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, Row
+from obsynth.monitoring.logs.log_observer import DECIDING, RECOVERING, Row
 from obsynth.monitoring.logs.observer_of_design import log_observer
-from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
+from obsynth.monitoring.logs.operating_point import OperatingPointCheck
+from obsynth.monitoring.logs.recovered_states import RecoveredStates
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
 from obsynth.monitoring.logs.unit_check import UnitCheck
-from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_ranges import RowsBeyond
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
 from obsynth.monitoring.thresholds.watched_columns import as_learned
-from obsynth.numerics.arguments import is_finite_number, is_number, real_number
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import suggestion
-from obsynth.observers.linear.modes import SETTLED_TO, transient
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.saved_states import BY_COLUMNS
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_set_writing import digest_of, plain, restored
 
 #: What an alarm by a sensor that is stuck is called, before the name of its output.
 STUCK_SENSOR = "stuck sensor"
@@ -48,92 +40,6 @@ LATE = "recovered states"
 
 #: Rows that are taken in one piece at most.
 ROWS_AT_ONCE = 4096
-
-#: A signal is far from its operating point when its mean differs by this share of it.
-FAR_FROM_POINT = 0.2
-
-RUN_STATE_KIND = "obsynth run state"
-
-RUN_STATE_VERSION = 1
-
-STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"', suffix=".json")
-
-#: Parts that are seconds, or nothing before the first row.
-_TIME_PARTS = frozenset({"last", "longest"})
-
-
-class OperatingPointCheck:
-    """Gathers the first second of data, to tell whether they begin near the operating point."""
-
-    def __init__(self, signals: LogSignals) -> None:
-        self._signals = signals
-        self._begin: float | None = None
-        self.status = ""  # of the first row
-        self._taken = 0
-        self._start = np.full(len(signals.names), np.nan)
-        self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
-
-    def take(self, times: Sequence[float], deviations: FloatArray) -> None:
-        """Take rows: seconds, and deviations ``(n, nu + ny)`` of which some may be missing."""
-        for time, row in zip(times, deviations, strict=True):
-            if self._begin is None:
-                self._begin, self._start = time, np.array(row)
-            if not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
-                break
-            self._taken += 1
-            finite = np.isfinite(row)
-            self._sum[finite] += row[finite]
-            self._count[finite] += 1.0
-
-    def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
-        """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
-        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start.
-        Other designs leave out the first row as an outlier where it is so far away."""
-        observer, plant = design.observer, design.plant
-        refused = self.status == GAP and bool(np.isfinite(self._start).all())
-        if refused and any(event.first_row <= HOLD for event in alarms):
-            return (
-                f"All outputs of the first row are left out as outliers, and an alarm comes within {HOLD} rows: the "
-                "log may begin at other states than the design. State those at which it begins (states, or "
-                "initial_state), or a larger initial_covariance.",
-            )
-        if not (isinstance(observer, LinearObserver) and isinstance(plant, DescriptorSystem)) or self._begin is None:
-            return ()
-        noise = np.linalg.norm(plant.Dw, axis=1)
-        started = np.abs(self._start[len(self._start) - observer.By.shape[1] :])
-        if len(noise) != len(started) or not np.any(comparable := np.isfinite(started) & (noise > 0.0)):
-            return ()
-        shares = np.where(comparable, started, 0.0) / np.where(comparable, noise, 1.0)
-        worst = int(np.argmax(shares))
-        if shares[worst] * SETTLED_TO <= 1.0:
-            return ()
-        lasting = transient(observer) * math.log(shares[worst]) / -math.log(SETTLED_TO)
-        if not any(event.start < self._begin + lasting for event in alarms):
-            return ()
-        name = plant.output_names[worst]
-        is_stated = name in self._signals.point
-        where = "its operating point" if is_stated else "zero (no operating point is stated)"
-        advice = "Give" if is_stated else "State the operating point at which the log begins, or give"
-        return (
-            f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
-            f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "
-            f"{100.0 * SETTLED_TO:g} % of that response are left. {advice} a longer warm-up (--warm-up {lasting:.3g}).",
-        )
-
-    def warnings(self) -> tuple[str, ...]:
-        """Return a text for each signal with a stated operating point, not zero, that begins far from it."""
-        texts = []
-        for i, name in enumerate(self._signals.names):
-            point = self._signals.point.get(name, 0.0)
-            if point == 0.0 or self._count[i] == 0.0:
-                continue
-            away = self._sum[i] / self._count[i]
-            if abs(away) > FAR_FROM_POINT * abs(point):
-                texts.append(
-                    f"{name} begins at {point + away:.6g}, far from its operating point {point:.6g}: the linear model "
-                    "may not hold there, or the data are deviations already, or in another unit."
-                )
-        return tuple(texts)
 
 
 def damaged_state(path: Path) -> SpecError:
@@ -182,14 +88,7 @@ class LogRun:
         self.recovered = RecoveredStates.of(design.recovery, observer, recovered)
         extra = () if self.recovered is None else self.recovered.columns
         names = (*observer.columns, *extra)
-        for name, level in thresholds.items():
-            if name not in names:
-                raise SpecError(
-                    f"There is no column {name!r} to monitor: there are {', '.join(names)}.{_meant(name, names)}",
-                    path="thresholds",
-                )
-            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
-        self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
+        self._levels = _levels(thresholds, names)
         lags = observer.lags
         if self.recovered is not None and self.recovered.delay:
             lags.append((LATE, self.recovered.delay))
@@ -211,10 +110,7 @@ class LogRun:
             *((*monitor.columns, "statistic", "threshold") if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
         )
-        # Intervals of faults are in their own units, like the estimates.
-        point = dict(zip(observer.fault_names, self._point[self._faults].tolist(), strict=True))
-        ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
-        self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
+        self._shifts = self._shifts_of_intervals()
         self.first, self.rows = OperatingPointCheck(self.signals), 0
         self.units = None if units_as_is else UnitCheck(design, self.signals)
         #: The file of the state that the first rows go on from: only they show whether its parts fit together.
@@ -223,6 +119,12 @@ class LogRun:
         self.alarm_rows = dict[str, int]()
         self.events = AlarmLog(self.header)
         self.repeated = RepeatedValues(len(observer.output_names))
+
+    def _shifts_of_intervals(self) -> FloatArray:
+        """Return what is added to the columns of the monitor: intervals of faults are in the units of the estimates."""
+        point = dict(zip(self.observer.fault_names, self._point[self._faults].tolist(), strict=True))
+        ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
+        return np.array([ends.get(name, 0.0) for name in (() if self.monitor is None else self.monitor.columns)])
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output (``chunk (rows, 1 + nu + ny)``)."""
@@ -525,73 +427,22 @@ class LogRun:
         self.units = None
 
 
-def save_state(path: Path, run: LogRun, digest: str) -> None:
-    """Write what a run carries from row to row, atomically."""
-    body = plain({"gains": digest, "state": run.as_dict()})
-    write_atomically(path, sealed(RUN_STATE_KIND, RUN_STATE_VERSION, body, under="run"))
-
-
-def resume_state(path: Path, run: LogRun, digest: str) -> None:
-    """Let a run go on from a saved state."""
-    # The state is written again at the end, so it is no input that has to be kept.
-    document = read_json(path, is_protected=False)
-    is_run_state = isinstance(document, dict) and document.get("kind") == RUN_STATE_KIND
-    if not is_run_state or document.get("schema_version") != RUN_STATE_VERSION:
-        raise SpecError(f"{path} is no saved state of a run.", path=str(path))
-    body = document.get("run")
-    try:
-        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
-    except (ValueError, RecursionError):  # a number too large for a float
-        intact = False
-    if not intact:
-        raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
-    if body.get("gains") != digest:
-        raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
-    own = run.as_dict()
-    try:
-        state = restored(body.get("state"))
-        run.resume(state)
-        fits = _fits(own, state)
-    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
-        fits = False
-    if not fits:
-        raise damaged_state(path)
-    run.resumed_from = path
+def _levels(thresholds: Mapping[str, float], names: Sequence[str]) -> tuple[tuple[str, int, float], ...]:
+    """Return each column with a threshold: its name, its place among all of them, and its level."""
+    for name, level in thresholds.items():
+        if name not in names:
+            raise SpecError(
+                f"There is no column {name!r} to monitor: there are {', '.join(names)}.{_meant(name, names)}",
+                path="thresholds",
+            )
+        real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
+    return tuple((name, names.index(name), level) for name, level in thresholds.items())
 
 
 def _meant(name: str, names: Sequence[str]) -> str:
     """Return a question with the column that a signal without brackets may mean, or one of a like name."""
     of_signal = [column for column in names if column.endswith(f"[{name}]")]
     return f" Did you mean {' or '.join(map(repr, of_signal))}?" if of_signal else suggestion(name, names)
-
-
-def _fits(own: Any, saved: Any) -> bool:
-    """Whether a saved state has the parts of a run's own one; what has no value yet may hold numbers and arrays."""
-    if isinstance(own, np.ndarray):
-        saved_array = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
-        return isinstance(saved_array, np.ndarray) and _alike(own.shape, saved_array.shape)
-    if isinstance(own, Mapping):
-        if not isinstance(saved, dict) or saved.keys() != own.keys():
-            return False
-        return all(
-            _fits(own[key], saved[key])
-            and (key not in _TIME_PARTS or saved[key] is None or is_finite_number(saved[key]))
-            for key in own
-        )
-    if isinstance(own, (bool, np.bool_)):
-        return isinstance(saved, bool)
-    if isinstance(own, str):
-        return isinstance(saved, str)
-    if isinstance(own, (list, tuple)):
-        return isinstance(saved, list)
-    return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
-
-
-def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:
-    """Whether an array can stand for another one: windows fill up, and factors of covariances change their width."""
-    if len(own) == 2 and len(saved) == 2:
-        return own[0] == saved[0] or own[1] == saved[1]
-    return own == saved
 
 
 def faults_on_rows(

@@ -20,8 +20,9 @@ from obsynth.monitoring.alarms.events import AlarmEvent, rows_in_alarm
 from obsynth.monitoring.logs.clock import STALE
 from obsynth.monitoring.logs.followed import FollowedLog
 from obsynth.monitoring.logs.log_observer import GAP
-from obsynth.monitoring.logs.log_run import LogRun, resume_state, save_state
+from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.measured_columns import never_measured
+from obsynth.monitoring.logs.saved_run import resume_state, save_state
 from obsynth.monitoring.logs.signals import TIME_HEADER
 from obsynth.monitoring.logs.sinks import FrameSink, Sink, sink_for
 from obsynth.monitoring.logs.smoothing import LaterRows

@@ -18,11 +18,11 @@ from obsynth.monitoring.logs.sources import samples
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import read_only
+from obsynth.observers.changed_options import changed
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.sample import deviations_in
-from obsynth.observers.running import changed
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.smoothing import (
     checked_lag,

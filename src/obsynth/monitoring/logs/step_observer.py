@@ -11,10 +11,10 @@ from obsynth.monitoring.logs.log_observer import GAP, OK, PARTIAL, RECOVERING, W
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.monitoring.thresholds.watched_columns import innovation_names
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.changed_options import as_run, rule_of_outliers
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.irregular_steps import IrregularSteps
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.observers.smoothing_chain import SmootherHistory
 from obsynth.results.design import ObserverDesign
 

@@ -11,10 +11,10 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.monitoring.logs.signals import LogSignals
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.changed_options import plain_recursion
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import plain_recursion
 from obsynth.results.design import ObserverDesign
 
 #: Rows that are looked at, and how many a log has at least for that.

@@ -32,8 +32,8 @@ from obsynth.monitoring.thresholds.watched_columns import (
 )
 from obsynth.monitoring.thresholds.wrong_pairs import LEAST_WRONG, NEARER, Pair, believed_pairs, taken_back, without
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.changed_options import changed
 from obsynth.observers.outliers import checked_limit
-from obsynth.observers.running import changed
 from obsynth.results.design import ObserverDesign
 
 #: Pairs may take this share of the rate of false alarms; where they would take more the levels are to hold with them.

@@ -14,11 +14,11 @@ from obsynth.monitoring.thresholds.learned_levels import (
 )
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.changed_options import changed
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.steady_filter import settled_contraction
-from obsynth.observers.running import changed
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.results.design import ObserverDesign

@@ -125,7 +125,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
 
 def _target(options: argparse.Namespace) -> Path | TextIO:
     """Return where estimates go; refuse a hopeless place before any work is done."""
-    from obsynth.monitoring.logs.log_run import STATE
+    from obsynth.monitoring.logs.saved_run import STATE
     from obsynth.monitoring.logs.sinks import ESTIMATES
     from obsynth.monitoring.logs.sources import check_suffix
 

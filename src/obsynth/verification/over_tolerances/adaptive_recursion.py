@@ -94,6 +94,10 @@ class AdaptiveState(NamedTuple):
 _ARRAYS = ("psi", "ring", "eps", "largest", "past", "moved")
 
 
+#: State, bounds of the channel rows, ``|phi|`` of each constant, and the shift of the outputs' middle.
+_FirstOrder: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
+
+
 def thresholds_of_records(
     bound: AdaptiveBound, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> Thresholds:
@@ -162,10 +166,6 @@ def _adaptive_samples(
     total = (bound.nominal[m:] + start[:, m:] + first.sum(axis=2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
     after = state._replace(ring=ring[:, count:], eps=eps[:, count:], largest=largest[:, -1], k=state.k + count)
     return after, Thresholds(total, first, shift, start[None, :, m:], rest)
-
-
-#: State, bounds of the channel rows, ``|phi|`` of each constant, and the shift of the outputs' middle.
-_FirstOrder: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
 
 
 def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _FirstOrder:

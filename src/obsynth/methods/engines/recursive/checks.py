@@ -23,6 +23,7 @@ from obsynth.methods.engines.recursive.horizon_proof import (
 )
 from obsynth.methods.engines.recursive.steady_state import steady_rows
 from obsynth.numerics.arrays import remembered
+from obsynth.observers.changed_options import plain_recursion
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
@@ -33,7 +34,6 @@ from obsynth.observers.recursive.gain_schedule_summary import (
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.options import observer_from_options
-from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
