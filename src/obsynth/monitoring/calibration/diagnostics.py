@@ -32,6 +32,10 @@ BoolArray = NDArray[np.bool_]
 #: Lags of the whiteness test, and their least number of rows each.
 WHITENESS_LAGS, ROWS_PER_LAG = 10, 5
 
+#: Rows of each part of a log whose periodograms are averaged, at most and at least, and how many parts there are at
+#: least: with fewer rows, or parts, the largest power of white noise is at any period.
+LONGEST_SPECTRUM, LEAST_SPECTRUM, SPECTRUM_PARTS = 256, 16, 4
+
 #: Probability of the interval of a mean square.
 INTERVAL = 0.95
 
@@ -111,6 +115,22 @@ def whiteness(column: FloatArray) -> Whiteness:
     r = np.array([float(e[lag:] @ e[:-lag]) / power for lag in range(1, lags + 1)])
     statistic = float(n * (n + 2.0) * (r**2 / (n - np.arange(1, lags + 1))).sum())
     return Whiteness(statistic, float(chi2.sf(statistic, lags)), float(r[0]))
+
+
+def largest_power(column: FloatArray) -> tuple[float, float]:
+    """Return at which period in rows the power of a column is largest, and how many times its mean over all frequencies
+    it is there; zeros where there are too few rows. Values that are NaN count as the mean."""
+    from scipy.signal import welch
+
+    measured = np.isfinite(column)
+    length = min(LONGEST_SPECTRUM, len(column) // SPECTRUM_PARTS)
+    if length < LEAST_SPECTRUM or not measured.any() or not np.ptp(column[measured]) > 0.0:
+        return 0.0, 0.0
+    e = np.where(measured, column - column[measured].mean(), 0.0)
+    frequencies, power = welch(e, nperseg=length, detrend=False)
+    own = slice(1, None)
+    place = int(np.argmax(power[own]))
+    return float(1.0 / frequencies[own][place]), float(power[own][place] / power[own].mean())
 
 
 def change_of_mean(whitened: FloatArray) -> int | None:
@@ -194,6 +214,7 @@ class SensorValidation:
     nis: Consistency  # mean square in units of the expected variance, with its 95 % interval
     mean: float  # of the innovations, in standard deviations of such a mean for white ones; beyond 3 it is an offset
     whiteness: Whiteness  # test of Ljung and Box
+    power: tuple[float, float] = (0.0, 0.0)  # the period in rows with the largest power, and its multiple of the mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +301,7 @@ class Validation:
                     "nis": vars(sensor.nis) | {"holds": sensor.nis.holds},
                     "mean": sensor.mean,
                     "whiteness": vars(sensor.whiteness),
+                    "largest_power": {"period": sensor.power[0], "multiple": sensor.power[1]},
                 }
                 for name, sensor in self.sensors.items()
             },

@@ -20,6 +20,9 @@ LEAST_EXPLANATION = 3.0
 #: Explanations that are reported, and constants that are tried: each costs a run over the log.
 MOST_LISTED, MOST_CONSTANTS = 3, 12
 
+#: Inputs whose delays are tried.
+MOST_INPUTS = 12
+
 #: Relative change of a constant by which its effect on the innovations is found: small beside any error worth telling.
 CONSTANT_CHANGE = 1e-3
 
@@ -36,17 +39,21 @@ def explanations(
     dt: float,
     constants: Mapping[str, float],
     with_constant: Callable[[str, float], FloatArray],
+    with_later_input: Callable[[int, int], FloatArray] | None = None,
 ) -> tuple[Explanation, ...]:
     """Return what explains innovations ``(n, ny)`` best, the largest gain first.
 
     ``with_constant(name, value)``: the innovations, in the same deviations, with another value of a constant; NaN where
     the plant has no solution with it.  The constants that are told have been run with the value that is told.
+    ``with_later_input(i, rows)``: the innovations with an input later by so many rows, where a run takes no long time.
     """
     candidates, values = [*_of_sensors(innovations, output_names, dt)], dict[str, tuple[str, float]]()
-    for i, name in enumerate(input_names):
-        moves = np.diff(inputs[:, i])
-        for move, word in ((np.append(np.nan, moves), "later"), (np.append(moves, np.nan), "earlier")):
-            gain, _ = _regression(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
+    for i, name in enumerate(input_names[:MOST_INPUTS]):
+        for rows, word in ((1, "later"), (-1, "earlier")):
+            if with_later_input is not None:
+                gain = _of_run(innovations, with_later_input(i, rows))
+            else:
+                gain = _of_moves(innovations, inputs[:, i], rows)
             candidates.append((f"an input {name} that acts {word} than the design takes it", gain))
     for name, value in list(constants.items())[:MOST_CONSTANTS]:
         step = CONSTANT_CHANGE * (abs(value) or 1.0)
@@ -62,6 +69,14 @@ def explanations(
         for text, gain in clear[:MOST_LISTED]
     ]
     return tuple(sorted((item for item in tried if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1]))
+
+
+def _of_moves(innovations: FloatArray, values: FloatArray, rows: int) -> float:
+    """Return the gain in nats of what an input that acts one row later, or earlier (-1), does to the first innovation
+    after each of its moves."""
+    moves = np.diff(values)
+    move = np.append(np.nan, moves) if rows > 0 else np.append(moves, np.nan)
+    return _regression(innovations, move[:, None, None] * np.eye(innovations.shape[1]))[0]
 
 
 def _of_run(before: FloatArray, after: FloatArray) -> float:

@@ -16,11 +16,20 @@ from obsynth.monitoring.calibration.diagnostics import (
     Validation,
     change_of_mean,
     consistency,
+    largest_power,
+    standing_out,
     whiteness,
     wrong_samples,
 )
 from obsynth.monitoring.calibration.explanations import Explanation, explanations, whitened
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
+from obsynth.monitoring.calibration.linear_validation import (
+    filter_of_linear_plant,
+    is_linear,
+    notes_on_disturbances,
+    sentences_on_sizes,
+    sentences_on_units,
+)
 from obsynth.monitoring.calibration.logs import LogData, RecordedLog, quantum, read_log
 from obsynth.monitoring.calibration.maximum import Maximum, Objective, greatest_likelihood
 from obsynth.monitoring.calibration.plants import NonlinearPlant
@@ -260,7 +269,9 @@ def validate(
     Parameters
     ----------
     design : ObserverDesign
-        Recursive or nonlinear: one that predicts its outputs with a covariance.
+        Recursive or nonlinear: one that predicts its outputs with a covariance.  Of a linear design it is the plant
+        that is compared, by the Kalman filter with the noise that it states: without faults, from any start, and with
+        unknown disturbances that may be anything.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, inputs and outputs.
     rows : str, slice or pair, optional
@@ -276,12 +287,13 @@ def validate(
     -------
     Validation
         NIS per degree of freedom, mean and whiteness of each sensor's innovations, variances that the log contradicts,
-        and a verdict with what to change.
+        and a verdict with what to change: a signal that is likely in another unit, too.
 
     Raises
     ------
     SpecError
-        The design has no innovations with a covariance, a name is unknown, or the log cannot be used.
+        The design has no innovations with a covariance, its plant states no noise, a name is unknown, or the log cannot
+        be used.
     SolverError
         A step of a nonlinear plant has no solution along the log.
 
@@ -305,8 +317,11 @@ def validate(
     True
     """
     note = progress or (lambda text: None)
+    stated, linear = design, is_linear(design)
     record_log = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
     note(f"innovations of {record_log.samples} rows")
+    if linear:
+        design, record_log = _of_linear_plant(design, record_log)
     whole_walk = recorded_innovations(design, record_log)
     design, record, walk_notes = _as_far_as_it_walks(design, record_log, whole_walk, note)
     far_off, near = _far(whole_walk.estimates, design, record_log.samples)
@@ -315,14 +330,20 @@ def validate(
     place = change_of_mean(record.standardised if white else whitened(record.standardised))
     change = None if place is None else record_log.rows[0] + place
     ratios, explained = _contradicted(design, record_log, record, sensors, total, note)
-    sentences = _sentences(sensors, ratios, change, far_off, coloured=explained is not None)
+    sentences = _sentences(sensors, ratios, change, far_off, record_log.dt, coloured=explained is not None)
     if explained is not None:
-        sentences.append(_explained(explained))
+        sentences.append(_explained(explained, linear=linear))
+    if linear:
+        # In another unit nothing else that innovations say has a meaning.
+        sizes = sentences_on_sizes(sensors, total, explained or ())
+        sentences = sentences_on_units(design, record_log) or [*sentences, *sizes]
     passed = total.holds and not sentences
     if not (passed or total.holds or ratios) and explained is None:
         far = "small" if total.value > total.high else "large"
+        noise = "The stated noise is" if linear else "Q and R are"
+        together = " all" if linear else " together"
         sentences.append(
-            f"Q and R are too {far} together: the innovations are {np.sqrt(total.value):.2g} times what is expected."
+            f"{noise} too {far}{together}: the innovations are {np.sqrt(total.value):.2g} times what is expected."
         )
     error = _integration_error(design.observer, record_log, record)
     if error is not None and error.matters:
@@ -340,7 +361,7 @@ def validate(
         sensors,
         ratios,
         change,
-        (*record_log.notes, *walk_notes, *near, *sentences),
+        (*record_log.notes, *walk_notes, *near, *notes_on_disturbances(stated, sensors), *sentences),
         read_only(record.innovations),
         read_only(record.deviations),
         read_only(np.array(record_log.y)),
@@ -359,13 +380,13 @@ def _usable_log(
     scales: Mapping[str, float] | None,
 ) -> RecordedLog:
     """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
-    if not states_innovations(design):
+    if not (states_innovations(design) or is_linear(design)):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual with which a log could be compared: "
-            "validate a recursive or nonlinear design, or run the log with a monitor.",
+            "validate a recursive, nonlinear or linear design of the plant, or run the log with a monitor.",
             path="design",
         )
-    plant = design.plant
+    plant = design.linear[0] if is_linear(design) else design.plant
     factors = dict(getattr(plant, "scales", {})) | dict(scales or {})
     record = read_log(
         log,
@@ -374,7 +395,7 @@ def _usable_log(
         rows=rows,
         columns=columns,
         scales=factors,
-        dt=design.observer.dt,
+        dt=design.observer.dt or None,
         units=plant.units,
     )
     if record.samples < LEAST_VALIDATED_ROWS:
@@ -384,6 +405,12 @@ def _usable_log(
             code="too-short",
         )
     return record.shifted(design.input_delay).without(wrong_samples(record.y))
+
+
+def _of_linear_plant(design: ObserverDesign, log: RecordedLog) -> tuple[ObserverDesign, RecordedLog]:
+    """Return the Kalman filter of the plant of a linear design, and the log without samples that it excludes."""
+    made = filter_of_linear_plant(design, log, lambda tried: recorded_innovations(tried, log).states)
+    return made, log.without(standing_out(recorded_innovations(made, log).standardised))
 
 
 def _contradicted(
@@ -455,7 +482,7 @@ def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, Sen
         count = int(measured.sum())
         mean = float(column[measured].mean() * np.sqrt(count)) if count else 0.0
         by_sensor[name] = SensorValidation(
-            consistency(float((column[measured] ** 2).sum()), count), mean, whiteness(column)
+            consistency(float((column[measured] ** 2).sum()), count), mean, whiteness(column), largest_power(column)
         )
     return by_sensor
 
@@ -465,6 +492,7 @@ def _sentences(
     ratios: Mapping[str, float],
     change: int | None,
     far: Mapping[str, float],
+    dt: float,
     *,
     coloured: bool,
 ) -> list[str]:
@@ -481,7 +509,7 @@ def _sentences(
         if sensor.whiteness.probability < SIGNIFICANT:
             sentences.append(
                 f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
-                f"autocorrelation {sensor.whiteness.first:+.2f}): "
+                f"autocorrelation {sensor.whiteness.first:+.2f}{_spectrum(sensor, dt)}): "
                 + ("coloured noise or a model error." if coloured else "Q against R is wrong.")
             )
     if change is not None:
@@ -495,6 +523,12 @@ def _sentences(
             f"wrong, {'coloured noise acts on it, ' if coloured else ''}or the rows are not free of faults."
         )
     return sentences
+
+
+def _spectrum(sensor: SensorValidation, dt: float) -> str:
+    """Return at which periods the power of innovations is largest, in words; empty where a log is too short for it."""
+    rows, multiple = sensor.power
+    return f", {multiple:.2g} times their mean power at periods of about {rows * dt:.2g} s" if rows else ""
 
 
 def _white(sensors: Mapping[str, SensorValidation]) -> bool:
@@ -527,6 +561,12 @@ def _explanations(
             return np.full(record.innovations.shape, np.nan)
         return np.asarray(rerun.innovations / record.deviations)
 
+    def with_later_input(i: int, rows: int) -> FloatArray:
+        note(f"innovations with {design.plant.input_names[i]} {abs(rows)} row {'later' if rows > 0 else 'earlier'}")
+        u = np.array(log.u)
+        u[:, i] = log.shifted(rows).u[:, i]
+        return np.asarray(recorded_innovations(design, replace(log, u=u)).innovations / record.deviations)
+
     return explanations(
         record.standardised,
         log.u,
@@ -535,17 +575,20 @@ def _explanations(
         dt=log.dt,
         constants=constants,
         with_constant=with_constant,
+        with_later_input=with_later_input if isinstance(observer, RecursiveObserver) else None,
     )
 
 
-def _explained(causes: Sequence[Explanation]) -> str:
+def _explained(causes: Sequence[Explanation], *, linear: bool) -> str:
     if not causes:
         return "No single offset, correlated noise, delay of an input or constant explains that: plot the residuals."
     listed = "; ".join(f"{text} ({gain:.3g} nats)" for text, gain in causes)
-    return (
-        f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "
-        "corrected."
+    noise = (
+        "Judge the stated noise again once that is corrected."
+        if linear
+        else "The factors of Q and R have no meaning until that is corrected."
     )
+    return f"What explains it best, by likelihood: {listed}. {noise}"
 
 
 def _far(

@@ -79,24 +79,34 @@ class UnitCheck:
         self._done = True
         if len(self._rows) < LEAST_ROWS:
             return
-        explanation = self._change(np.array(self._rows))
+        explanation = self.explanation(np.array(self._rows))
         if explanation is None:
             return
-        name, change = explanation
+        raise SpecError(
+            f"{self.words(*explanation)}; or go on as it is (--units-as-is, units_as_is=True).",
+            path=f"columns.{explanation[0]}",
+        )
+
+    @staticmethod
+    def words(name: str, change: ChangeOfUnit) -> str:
+        """Return that a signal is likely in another unit, and what to do about it."""
         if change.shift:
             remedy = f"convert its column, or name its unit in the header and in the plant: {name} (K)"
         else:
             option = f"--scale {shlex.quote(name)}={change.factor:.15g}"
             remedy = f"give the factor ({option}, scales={{{name!r}: {change.factor:.15g}}})"
         made = f"adding {change.shift:g}" if change.shift else f"multiplying by {change.factor:.6g}"
-        raise SpecError(
+        return (
             f"From its first row on {name} is not what the design expects, and is after {made} ({change.words}): "
-            f"{remedy}; or go on as it is (--units-as-is, units_as_is=True).",
-            path=f"columns.{name}",
+            f"{remedy}"
         )
 
-    def _change(self, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
-        """Return the signal and the change of its unit that explain rows which are not explained as they are."""
+    def explanation(self, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
+        """Return the signal and the change of its unit that explain the first of ``rows (n, nu + ny)``, which are not
+        explained as they are."""
+        rows = rows[:FIRST_ROWS]
+        if len(rows) < LEAST_ROWS:
+            return None
         observer = self._design.observer
         if isinstance(observer, (RecursiveObserver, DAEObserver)):
             return None if observer.timing.longest else self._by_innovations(plain_recursion(observer), rows)
