@@ -219,6 +219,32 @@ def test_what_passes_at_once_bounds_every_filter(case, bound) -> None:
     assert proved_at_infinity(derived, Setting((), (ONE_FAULT,), False)) is None
 
 
+def test_what_passes_at_once_bounds_exact_filters() -> None:
+    """Two outputs show a fault each, which noise hides by sqrt(5) and 3; an unknown input moves a third one alone."""
+    from obsynth.verification.invisible_at_infinity import proved_at_infinity
+    from obsynth.verification.invisible_faults import Setting
+
+    case = plant(
+        A=[[-1.0]], Bf=[[1, 1]], Bd=[[1]], Bw=[[1, 1, 1]], C=[[1], [1], [1]], Df=[[1, 0], [0, 1], [0, 0]],
+        Dd=[[0], [0], [1]], Dw=[[1, 2, 0], [0, 0, 3], [0, 0, 0]], dt=0.0,
+    )  # fmt: skip
+    both = (np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.eye(2))
+    assert proved_at_infinity(case, Setting((), (both,), True)) == pytest.approx(3.0, rel=1e-14)
+    first = case.replace(Bf=case.Bf[:, :1], Df=case.Df[:, :1], fault_names=["f1"])
+    # The second output, which is noise now, tells nothing of the first.
+    assert proved_at_infinity(first, Setting((), (ONE_FAULT,), True)) == pytest.approx(5.0**0.5, rel=1e-14)
+    # An output that shows a quarter of the fault, if it were answered by at most 2, takes half of it off the error.
+    faint = plant(
+        A=[[-1.0]], Bf=[[1]], Bw=[[1]], C=[[1], [1]], Df=[[1], [0.25]], Dw=[[1], [0]], dt=0.0,
+    )  # fmt: skip
+    for limit, bound in ((0.0, 1.0), (2.0, 0.5)):
+        setting = Setting((), (ONE_FAULT,), True, (1,), limit)
+        assert proved_at_infinity(faint, setting) == pytest.approx(bound, rel=1e-14)
+    # Outputs that show faults through states only do not show them at once.
+    lazy = first.replace(Df=[[0.0], [0.0], [0.0]])
+    assert proved_at_infinity(lazy, Setting((), (ONE_FAULT,), True)) is None
+
+
 def test_the_papers_plant_has_exactly_1_and_with_one_more_sample_0() -> None:
     spec = obsynth.load_spec(DESIGNS / "wang2015" / "spec.yaml")
     one = obsynth.optimal_filter(spec.plant, delay=1)
