@@ -98,6 +98,39 @@ def test_computed_numbers_are_reduced_in_floating_point(index, in_constraints, s
     assert (np.abs(turned.E @ speed - right) <= 1e-8 * sizes).all()
 
 
+def rounded_sums(seed, *, proper):
+    """A plant of index 2 to 4 of which E holds whole numbers and A rounded sums of thirds, and its finite modes; not
+    ``proper``: a fault enters every equation."""
+    rng = np.random.default_rng([46, seed])
+    n, m = int(rng.integers(1, 4)), int(rng.integers(2, 5))
+    e0, a0 = np.zeros((n + m, n + m)), np.eye(n + m)
+    e0[:n, :n], e0[n:, n:] = np.eye(n), np.eye(m, k=1)
+    a0[:n, :n] = np.round(rng.standard_normal((n, n)), 1) / 3.0
+    left, right = regular(rng, n + m), regular(rng, n + m)
+    acting = np.vstack([integer(rng, n + 1, 2), np.zeros((m - 1, 2))]) / 3.0
+    if not proper:
+        acting[:, 1] = 1.0 / 3.0
+    plant = obsynth.DescriptorSystem(
+        E=left @ e0 @ right, A=left @ a0 @ right, C=(1.0 + rng.random((2, n + m))) @ right, dt=1.0,
+        B=left @ acting[:, :1], Bf=left @ acting[:, 1:],
+    )  # fmt: skip
+    return plant, n
+
+
+def test_rounding_of_a_does_not_make_algebraic_equations_solvable():
+    # Those that only the last digits of A make regular were solved, and the result was another plant.
+    for seed in range(12):
+        plant, modes = rounded_sums(seed, proper=True)
+        reduced = obsynth.eliminate_algebraic_states(plant).plant
+        assert reduced.nx == modes
+        for s in (1.7, 0.3 + 1.2j):
+            for kind in ("u", "f"):
+                np.testing.assert_allclose(transfer(reduced, s, kind), transfer(plant, s, kind), rtol=1e-6, atol=1e-6)
+        plant, _ = rounded_sums(seed, proper=False)
+        with pytest.raises(obsynth.PreconditionError, match="later sample of f1"):
+            obsynth.eliminate_algebraic_states(plant)
+
+
 def test_an_output_that_needs_a_derivative_names_the_signal():
     """The speed is measured of a mass whose position is moved by an unknown signal."""
     plant = obsynth.DescriptorSystem(

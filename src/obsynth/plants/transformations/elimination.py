@@ -161,8 +161,9 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     exact = exact_elimination(plant)
     if exact is None:
         return None
-    if holds_computed(plant.E) and plant.nx - sum(structure_of(plant).infinite_block_sizes) != len(exact.pivots):
-        # Singular only before it was rounded.
+    computed = holds_computed(plant.E) or holds_computed(plant.A)
+    if computed and plant.nx - sum(structure_of(plant).infinite_block_sizes) != len(exact.pivots):
+        # E or the algebraic equations are singular but for the rounding of their entries.
         return None
     count = len(exact.pivots)
     whole = int(np.sum(plant.E.any(axis=0))) == count

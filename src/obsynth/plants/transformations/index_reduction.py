@@ -159,7 +159,18 @@ def _split(plant: DescriptorSystem) -> _Split | None:
         return None
     count = plant.nx - sum(structure_of(plant).infinite_block_sizes)
     exact_split = _split_exactly(plant, count) if plant.exact is None else None
-    return exact_split or _split_in_floating_point(plant, count)
+    if exact_split is None:
+        return _split_in_floating_point(plant, count)
+    if not exact_split.differentiated.any() or not _holds_computed(plant):
+        return exact_split
+    # What computed numbers make of a derivative may be their rounding.
+    rounded = _split_in_floating_point(plant, count)
+    same = rounded is not None and np.array_equal(rounded.differentiated != 0.0, exact_split.differentiated != 0.0)
+    return exact_split if same else rounded
+
+
+def _holds_computed(plant: DescriptorSystem) -> bool:
+    return any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", "B", "Bf", "Bd", "Bw"))
 
 
 def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
@@ -233,13 +244,15 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     own = shift * np.eye(count) - np.linalg.inv(j)
     b = np.linalg.solve(j, driven[:count])
     states = _but_small(nilpotent @ algebraic, np.abs(nilpotent) @ np.abs(g) @ np.abs(constrained))
-    later = np.abs(nilpotent) @ np.abs(g @ n) @ np.abs(algebraic)
+    # Entries of n that are zero were rounded beside its largest one.
+    coupled = np.abs(g @ n) + np.max(np.abs(g @ n), initial=0.0)
+    later = np.abs(nilpotent) @ coupled @ np.abs(algebraic)
     differentiated = _but_small(nilpotent @ g @ n @ algebraic, later)
     v, factor = units.states[:, None], units.states[rows]
     orders, term = [], algebraic
     for order in range(1, plant.nx - count + 1):
         # What is rounding beside the terms of one order is not carried on to the next.
-        term = _but_small(-g @ n @ term, np.abs(g @ n) @ np.abs(term))
+        term = _but_small(-g @ n @ term, coupled @ np.abs(term))
         if not term.any():
             break
         orders.append(v * _but_small(nilpotent @ term, np.abs(nilpotent) @ np.abs(term)) * units.rate**order)
