@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from obsynth.numerics.central_equation import CentralEquation, central_injection
 from obsynth.numerics.injection_problem import GainProblem, Injection, NormalisedProblem, normalise
 from obsynth.numerics.lapack import least_squares
 from obsynth.numerics.least_level import NEXT_TO, GammaIteration
+from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencil_points import GENERIC_POINTS
 
@@ -67,6 +68,10 @@ DECOUPLED_GAIN = 1e-7
 
 #: Pairs of level and artificial noise: what this noise costs goes with its square, but many states need some.
 DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
+
+#: One more where rounding spoiled them all, and the share of the gain below which a filter of few states is worth other
+#: coordinates, in which the attempts are repeated: a descent of the level would take a hundred equations.
+COARSE_ATTEMPT, WORTH_COORDINATES = (1e-1, 1e-4), 0.05
 
 #: The same share where states are many: no gain that is shipped is smaller than ten times that.
 COARSELY_DECOUPLED = 1e-4
@@ -120,15 +125,17 @@ def search_central_filter(
     gain: float | None = None,
     *,
     start_is_good: bool = False,
+    hastens: bool = False,
 ) -> tuple[Injection, float]:
     """Return the best central filter found, and (a bound on) its true gain.
 
     The least level with little noise first; other noises, cheaper or less sensitive, where they reach one below.
+    ``hastens``: a filter that no disturbance hardly reaches is returned at once, as a start in other coordinates.
     """
     tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
     low, least_noise, most_noise = least_level(problem), 0.0, np.inf
-    if low <= DECOUPLED_GAIN * gain and (decoupled := _decoupling_filter(problem, gain)) is not None:
+    if low <= DECOUPLED_GAIN * gain and (decoupled := _decoupling_filter(problem, gain, hastens)) is not None:
         return decoupled
     for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
         if gain <= low * (1.0 + 2.0 * tolerance):
@@ -159,14 +166,16 @@ def search_central_filter(
     return best, gain
 
 
-def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
-    """Return a filter that no disturbance reaches, and its gain; ``None`` where there is none."""
+def _decoupling_filter(problem: GainProblem, gain: float, hastens: bool) -> tuple[Injection, float] | None:
+    """Return a filter that no disturbance reaches, or hardly any, and its gain; ``None`` where there is none."""
     if not _follows_from_measurements(problem):
         return None
     # The artificial noise has a gain of its own, which in many states may be above the first level; next to a zero on
     # the unit circle only little of it leaves the equation a solution.
     best = None
-    for share, noise in DECOUPLING_ATTEMPTS:
+    for share, noise in (*DECOUPLING_ATTEMPTS, COARSE_ATTEMPT):
+        if (share, noise) == COARSE_ATTEMPT and (not hastens or (best is not None and best[1] < gain)):
+            break
         injection = central_injection(problem, share * gain, noise=noise)
         if injection is None:
             continue
@@ -174,8 +183,8 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
         if reached <= DECOUPLED_GAIN * gain:
             return injection, reached
         best = (injection, reached) if best is None or reached < best[1] else best
-    coarsely = best is not None and problem.order > FEW_STATES and best[1] <= COARSELY_DECOUPLED * gain
-    return best if coarsely else None
+    enough = WORTH_COORDINATES if hastens else COARSELY_DECOUPLED if problem.order > FEW_STATES else 0.0
+    return best if best is not None and best[1] <= enough * gain else None
 
 
 def _follows_from_measurements(problem: GainProblem) -> bool:
@@ -302,13 +311,36 @@ class LeastGain:
 
 def search_least_gain(problem: GainProblem) -> LeastGain:
     """Minimise the gain directly, improving the coordinates between passes."""
-    first = normalised = normalise(problem)
-    best = first.start
-    gain = starting = first.start_gain
+    first = normalise(problem)
+    starting = first.start_gain
+    if problem.measured == 0 or starting == 0.0:
+        return LeastGain(starting, first, first.start, starting, (starting, starting))
+    found = _passed(problem, first, hastens=problem.order <= FEW_STATES)
+    if found.hastened and found.gain > NEGLIGIBLE_GAIN * starting:
+        # The disturbance is not decoupled: its least gain is searched from the first coordinates on.
+        found = min(found, _passed(problem, first, hastens=False), key=lambda one: one.gain)
+    exact = replace(problem, judged_exactly=True)
+    if found.modes is not None:
+        exact.knows(found.injection, found.modes)
+    gain = exact.achieved_gain(found.injection)
+    return LeastGain(gain, first, found.injection, starting, (gain, gain), found.records)
+
+
+class _Passed(NamedTuple):
+    """The best filter of some passes, and whether one of them ended at a filter that was near enough."""
+
+    injection: Injection
+    gain: float
+    hastened: bool
+    modes: Modes | None
+    records: list[dict[str, Any]]
+
+
+def _passed(problem: GainProblem, first: NormalisedProblem, *, hastens: bool) -> _Passed:
+    """Search the least gain in coordinates that each pass makes better for the next one."""
+    normalised, best, gain = first, first.start, first.start_gain
     records: list[dict[str, Any]] = []
-    modes = None
-    if problem.measured == 0 or gain == 0.0:
-        return LeastGain(gain, first, best, starting, (gain, gain))
+    modes, hastened = None, False
     for number in range(MOST_PASSES):
         if problem.order == 0 or gain <= least_level(problem) * (1.0 + AT_THE_BOUND):
             break  # nothing is below
@@ -320,19 +352,16 @@ def search_least_gain(problem: GainProblem) -> LeastGain:
         known: float | None = gain / normalised.gain
         if not work.weight_is_free and np.any(start.V):
             start, known = Injection(start.R, np.zeros_like(start.V)), None
-        injection, level = search_central_filter(work, start, known, start_is_good=number > 0)
+        injection, level = search_central_filter(work, start, known, start_is_good=number > 0, hastens=hastens)
+        hastened |= hastens and level < WORTH_COORDINATES
         records.append({"what": "least gain", "solver": "central filter", "status": "optimal", "gain": level})
         if level * normalised.gain < gain:
             best, gain = normalised.restore(injection), level * normalised.gain
             # Found once, in one of the two coordinates, among many states.
             modes = normalised.restored_modes(work.modes(injection)) if problem.order > HIGHER_LEVEL_UP_TO else None
-        if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * starting:
+        if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * first.start_gain:
             break
-    exact = replace(problem, judged_exactly=True)
-    if modes is not None:
-        exact.knows(best, modes)
-    gain = exact.achieved_gain(best)
-    return LeastGain(gain, first, best, starting, (gain, gain), records)
+    return _Passed(best, gain, hastened, modes, records)
 
 
 def search_by_bisection(problem: GainProblem, *, tolerance: float) -> LeastGain:

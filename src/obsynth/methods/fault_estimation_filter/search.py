@@ -67,12 +67,13 @@ def found_gains(
     *,
     printed: PrintedInequality,
     progress: Callable[[str], None],
+    known: LeastGain | None = None,
 ) -> FoundGains:
-    """Search the least gain, and small gains for a slightly larger one."""
+    """Search the least gain, where it is not known, and small gains for a slightly larger one."""
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     progress("searching for the least gain")
     noisy = printed.plant.nw > 0
-    least = _least_gain(problem, method)
+    least = _least_gain(problem, method) if known is None else known
     unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
     if unfelt and noisy and problem.weight_limit is None:
         # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
@@ -99,12 +100,17 @@ def found_within(
     exactly: bool,
     printed: PrintedInequality,
     progress: Callable[[str], None],
+    known: LeastGain | None = None,
 ) -> FoundGains:
-    """Search gains; of a problem with a limit on the weight by the inequality, as Riccati equations do not cover it."""
+    """Search gains; of a problem with a limit on the weight by the inequality, as Riccati equations do not cover it.
+
+    ``known``: the least gain of the problem, not judged exactly, where it was searched before.
+    """
     search = partial(found_gains, method=method, printed=printed, progress=progress)
     problem = replace(problem, judged_exactly=exactly)
     if limited is None:
-        return search(problem, engine=method.engine)
+        known = known if method.gamma_search == "direct" and not exactly else None
+        return search(problem, engine=method.engine, known=known)
     limited = replace(limited, judged_exactly=exactly)
     if method.engine == "auto" and limited.weight_limit is not None:
         # They do where the limit costs nothing: what is found without it keeps it.

@@ -46,9 +46,10 @@ from obsynth.methods.fault_estimation_filter.printed_gains import weight_rows
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
-from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight, price_in_words
+from obsynth.methods.fault_estimation_filter.weights import least_by_weight, price_in_words
 from obsynth.methods.method import Synthesis, silent
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.central_filter import LeastGain
 from obsynth.observers.linear.means import averaged, unaveraged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -227,7 +228,7 @@ def _synthesised(
     s = None if method.S is None else as_matrix(method.S, "S")
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = method.residual_weight_limit
-    free, remarks = weight_by_gain(plant, prepared, method)
+    free, remarks, known = weight_by_gain(plant, prepared, method)
     other = None
     if remarks and plant.nx <= MOST_STATES_COMPARED:
         other = _of_other_weight(plant, conditions, prepared, replace(method, weight="paper" if free else "free"))
@@ -242,7 +243,7 @@ def _synthesised(
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
     printed = PrintedInequality(plant, prepared, parts, free, method.solver)
     search = partial(found_within, problem, limited, method, printed=printed, progress=progress)
-    outcome = search(exactly=False)
+    outcome = search(exactly=False, known=known)
     progress("building the realisation and its certificate")
     level = outcome.gamma if outcome.problem.disturbances else nominal
     gains, realised, factor, proved = _shipped(plant, prepared, parts, outcome, level, tries=FIRST_TRIES)
@@ -297,22 +298,22 @@ def _of_other_weight(
 
 def weight_by_gain(
     plant: DescriptorSystem, prepared: PreparedPlant, method: FaultEstimationFilter
-) -> tuple[bool, tuple[str, ...]]:
-    """Return whether W is free, and what a free W and the paper's give where both were compared.
+) -> tuple[bool, tuple[str, ...], LeastGain | None]:
+    """Return whether W is free; what a free W and the paper's give where both were compared, and the search of it.
 
     By default W is free where the plant states noise, or where that lowers the least gain by `WORTH_A_FREE_WEIGHT`.
     """
     if method.asks_for_free_weight is not None:
-        return method.asks_for_free_weight, ()
+        return method.asks_for_free_weight, (), None
     if plant.nw or not plant.nd:
-        return plant.nw > 0, ()
+        return plant.nw > 0, (), None
     if not gain_problem(prepared, free_weight=True)[0].measured:
-        return False, ()
-    upper, lower = least_gains_by_weight(prepared)
+        return False, (), None
+    upper, lower, of_paper, of_free = least_by_weight(prepared)
     is_free = bool(lower < (1.0 - WORTH_A_FREE_WEIGHT) * upper)
     taken_for = "the free W is taken" if is_free else "the paper's W is taken"
     remark = f"Least gamma with these T and N: {lower:.5g} with a free W, {upper:.5g} with the paper's W; {taken_for}."
-    return is_free, (remark,)
+    return is_free, (remark,), of_free if is_free else of_paper
 
 
 def _least(

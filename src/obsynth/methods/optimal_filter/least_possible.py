@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.errors import ObsynthError
-from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight
+from obsynth.methods.fault_estimation_filter.weights import least_by_weight
 from obsynth.methods.optimal_filter.delays import in_words
 from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
 from obsynth.methods.optimal_filter.realisation import minimal
@@ -140,7 +140,7 @@ def least_possible_of(plant: DescriptorSystem) -> str:
     if prepared is None or not all(condition.holds for condition in held):
         return ""
     delay = tuple(int(index or 0) for index in prepared.detectability.indexes)
-    paper, free = least_gains_by_weight(prepared)
+    paper, free, *_ = least_by_weight(prepared)
     bounded = _driven_by_disturbances(plant)
     here, later = (_least(bounded, _map_of(delay, more=more), "hinf") for more in (0, 1))
     return (
