@@ -86,7 +86,7 @@ def test_an_error_of_the_solver_is_unknown_and_not_infeasible(monkeypatch: pytes
 
 
 def test_what_cannot_be_bisected_is_refused() -> None:
-    with pytest.raises(SpecError, match="no parameter 'gamma'; there are: 'gamma_squared'"):
+    with pytest.raises(SpecError, match="no parameter 'gamma'; there are: gamma_squared"):
         obsynth.conditions.wang2015(PLANT, gamma=10.0).bisect("gamma", 1.0, 0.0)
     with pytest.raises(SpecError, match="none: give wang2015 a gamma"):
         obsynth.conditions.wang2015(PLANT).bisect("gamma_squared", 1.0, 0.0)

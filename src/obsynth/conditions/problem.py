@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from obsynth.conditions.options import VIOLATION_SHARE
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.numerics.arguments import arguments_checked, real_number, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, suggestion, there_are
 from obsynth.results.design import ObserverDesign
 from obsynth.results.registered import registered
 from obsynth.results.verification_report import VerificationReport, failed_rows
@@ -70,6 +71,9 @@ class Conditions:
     def __post_init__(self) -> None:
         data = {name: read_only(value) for name, value in self.data.items()}
         freeze(self, "variables", "parameters", "constraints", data=data)
+        for kind in ("variables", "parameters", "constraints", "data"):
+            named = _ByName(kind.removesuffix("s"), getattr(self, kind))
+            object.__setattr__(self, kind, MappingProxyType(named))
 
     @cached_property
     def existence(self) -> VerificationReport:
@@ -203,8 +207,12 @@ class Conditions:
         (True, ())
         """
         if parameter not in self.parameters:
-            listed = ", ".join(map(repr, self.parameters)) or "none: give wang2015 a gamma, for one"
-            raise SpecError(f"There is no parameter {parameter!r}; there are: {listed}.", path="parameter")
+            listed = (
+                there_are(parameter, self.parameters)
+                if self.parameters
+                else "there are none: give wang2015 a gamma, for one."
+            )
+            raise SpecError(f"There is no parameter {parameter!r}; {listed}", path="parameter")
         first, last = real_number(feasible, "feasible", "a number"), real_number(infeasible, "infeasible", "a number")
         share = real_number(tolerance, "tolerance", "a positive number", above=0.0)
 
@@ -279,7 +287,7 @@ class Conditions:
         unknown = [key for key in drop if key not in self.constraints]
         if unknown:
             raise SpecError(
-                f"There is no constraint {unknown[0]!r}; there are: {', '.join(map(repr, self.constraints))}.",
+                f"There is no constraint {unknown[0]!r}; {there_are(unknown[0], self.constraints)}",
                 path="drop",
             )
         remaining = {key: value for key, value in self.constraints.items() if key not in set(drop)}
@@ -314,6 +322,17 @@ def design_of(source: str, *arguments: Any) -> Callable[[dict[str, FloatArray], 
     return lambda gains, name: registered("design_of_conditions")(source, *arguments, gains, name)
 
 
+class _ByName(dict[str, Any]):
+    """Parts of conditions by name; one that does not exist is refused with those that do."""
+
+    def __init__(self, kind: str, parts: Mapping[str, Any]) -> None:
+        super().__init__(parts)
+        self.kind = kind
+
+    def __missing__(self, name: str) -> Any:
+        raise KeyError(f"no {self.kind} named {name!r}; {there_are(name, self)}")
+
+
 class Letters(dict[str, Any]):
     """Variables and data of a condition by letter; one that does not exist is refused with those that do."""
 
@@ -322,7 +341,8 @@ class Letters(dict[str, Any]):
         data = [letter for letter in self if letter not in variables]
         raise SpecError(
             f"There is no variable {name!r}: there are {', '.join(variables)}"
-            + (f", and the data {', '.join(data)}." if data else "."),
+            + (f", and the data {', '.join(data)}." if data else ".")
+            + suggestion(name, self),
             path="constraints",
         )
 

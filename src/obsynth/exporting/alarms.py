@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from obsynth.errors import SpecError
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import real_number, require_mapping
+from obsynth.numerics.suggestions import there_are
 from obsynth.observers.linear.modes import checked_warm_up, transient
 from obsynth.observers.scheduled.observer import ScheduledObserver
 
@@ -85,7 +86,7 @@ class Alarms:
         for name, level in (thresholds or {}).items():
             if name not in watched:
                 raise SpecError(
-                    f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
+                    f"There is no output {name!r} to monitor; {there_are(name, watched)}", path="thresholds"
                 )
             real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
         levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}

@@ -16,7 +16,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, real_number, shown
 from obsynth.numerics.arrays import FloatArray, freeze
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, there_are
 
 
 @fields_suggested
@@ -191,7 +191,7 @@ class NamedRegion:
     def of(cls, data: Mapping[str, Any], dt: float, *, path: str = "region") -> NamedRegion:
         """Return a checked region of poles in continuous time (``dt`` 0) or of samples of ``dt`` seconds."""
         known = [field.name for field in fields(cls)]
-        problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
+        problems = [f"unknown key {key!r}; {there_are(key, known)}" for key in data if key not in known]
         for key, value in data.items():
             if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
                 problems.append(f"{key} is {value!r}: give a positive number.")

@@ -14,6 +14,9 @@ MUCH_FARTHER = 2.5
 #: So many letters of a name are taken as its beginning.
 LEAST_BEGINNING = 3
 
+#: So many names are listed at most, of a network with hundreds of states for one.
+MOST_LISTED = 24
+
 Given = ParamSpec("Given")
 
 Returned = TypeVar("Returned")
@@ -31,6 +34,13 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     if not close and len(str(name)) >= LEAST_BEGINNING:
         close = [other for other in known if other.startswith(str(name))][:3]
     return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def there_are(name: Any, names: Iterable[Any]) -> str:
+    """Return the end of a message: which names there are, and the ones that may be meant by a wrong one."""
+    known = list(map(str, names))
+    more = f" and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
+    return f"there are: {', '.join(known[:MOST_LISTED]) or 'none'}{more}.{suggestion(str(name), known)}"
 
 
 def _closest(name: str, known: Sequence[str]) -> list[str]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
-from obsynth.numerics.suggestions import suggestion
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae_signals import finite_vector
 from obsynth.plants.signal_names import index_of
 
@@ -115,9 +115,9 @@ def named_vector(value: Any, names: Sequence[str], default: FloatArray, option: 
         return finite_vector(value, names, default, option)
     vector = np.array(default)
     for name, entry in value.items():
-        if name not in names and not suggestion(name, names):
-            raise SpecError(f"{option} has no signal named {name!r}; there are: {', '.join(names)}.", path=option)
-        vector[index_of(name, names, what=option)] = real_number(entry, f"{option}.{name}")
+        if name not in names:
+            raise SpecError(f"{option} has no signal named {name!r}; {there_are(name, names)}", path=option)
+        vector[names.index(name)] = real_number(entry, f"{option}.{name}")
     return vector
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import check_fields, is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import there_are
 
 _KEYS = ("nominal", "tolerance", "range", "unit")
 
@@ -337,7 +338,7 @@ def constant_of(name: str, entry: Any, *, nominal: float | None = None) -> Const
         raise SpecError(f"{name!r} is {entry!r}: give nominal and tolerance, or a range.", path=path)
     for key in entry:
         if key not in _KEYS:
-            raise SpecError(f"{key!r} is unknown: a constant has {', '.join(_KEYS)}.", path=f"{path}.{key}")
+            raise SpecError(f"A constant has no key {key!r}; {there_are(key, _KEYS)}", path=f"{path}.{key}")
     unit = entry.get("unit") or ""
     if not isinstance(unit, str):
         raise SpecError(f"The unit of {name!r} is {unit!r}, no text.", path=f"{path}.unit")

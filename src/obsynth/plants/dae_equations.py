@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.expressions import Expression, parse_expression, step_function
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae_fields import DAEFields
 
 #: The sign between two sides, which is no part of a comparison.
@@ -110,7 +111,7 @@ def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
     if unknown:
         raise SpecError(
             f"{path}: {expression.text!r} uses {', '.join(map(repr, unknown))}, which is no state, input, parameter, "
-            f"constant or earlier definition; there are: {', '.join(n for n in known if 'der(' not in n)}.",
+            f"constant or earlier definition; {there_are(unknown[0], (n for n in known if 'der(' not in n))}",
             path=path,
         )
     return symbolic_value(expression, known)

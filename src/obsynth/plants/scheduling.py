@@ -22,6 +22,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.expressions import Expression, parse_expression
+from obsynth.numerics.suggestions import there_are
 from obsynth.proofs.intervals import range_over
 
 #: 4,096 corners: more are not worth the time of a design (30 s with 64 vertices of 16 states).
@@ -107,8 +108,8 @@ class Scheduling:
             unknown = sorted(expression.names - set(names))
             if unknown:
                 raise SpecError(
-                    f"{expression.text!r} has {unknown[0]!r}, which is no scheduling parameter; there are: "
-                    f"{', '.join(names)}.",
+                    f"{expression.text!r} has {unknown[0]!r}, which is no scheduling parameter; "
+                    f"{there_are(unknown[0], names)}",
                     path="scheduling",
                 )
         if self.functions:
@@ -312,7 +313,9 @@ def parameters_of(scheduling: Any) -> dict[str, dict[str, Any]]:
         entry = entry if isinstance(entry, Mapping) else {"range": entry}
         unknown = sorted(set(map(str, entry)) - set(PARAMETER_KEYS))
         if unknown:
-            raise SpecError(f"{unknown[0]!r} is unknown: a parameter has {', '.join(PARAMETER_KEYS)}.", path=path)
+            raise SpecError(
+                f"A parameter has no key {unknown[0]!r}; {there_are(unknown[0], PARAMETER_KEYS)}", path=path
+            )
         ends = entry.get("range")
         if not (isinstance(ends, (list, tuple, np.ndarray)) and len(ends) == 2 and all(map(is_finite_number, ends))):
             raise SpecError(f"The range of {name!r} is {shown(ends)}: give [low, high], both finite.", path=path)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.results.checks import Check, all_hold
 
 
@@ -59,7 +59,7 @@ class VerificationReport:
         for check in self.checks:
             if check.name == name:
                 return check
-        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+        raise KeyError(f"no check named {name!r}; {there_are(name, [check.name for check in self.checks])}")
 
     def __repr__(self) -> str:
         """Return the table of the checks."""

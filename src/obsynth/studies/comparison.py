@@ -16,7 +16,7 @@ from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.report.plots.panels import (
     LINE_COLOURS,
     TRUE_STYLE,
@@ -346,7 +346,7 @@ class Comparison:
         for entry in self.methods:
             if entry.method == method:
                 return entry
-        raise KeyError(f"no method {method!r}; there are: {', '.join(entry.method for entry in self.methods)}")
+        raise KeyError(f"no method {method!r}; {there_are(method, [entry.method for entry in self.methods])}")
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table as texts: the header, then a row for each method and fault."""

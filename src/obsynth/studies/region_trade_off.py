@@ -13,6 +13,7 @@ from obsynth.errors import ObsynthError, SpecError, a_kind
 from obsynth.methods.designing import design as designed
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
@@ -178,7 +179,7 @@ def region_trade_off(
     made = [design for design in designs if isinstance(design, ObserverDesign)]
     known = [name for name in CLAIMS if made and all(name in design.certificate.claims for design in made)]
     if claim is not None and made and any(claim not in design.certificate.claims for design in made):
-        raise SpecError(f"No design claims {claim!r}: there are {', '.join(known)}.", path="claim")
+        raise SpecError(f"No design claims {claim!r}; {there_are(claim, known)}", path="claim")
     numbers = tuple(float("inf") if value is None else float(value) for value in values)
     return RegionTradeOff(by, numbers, claim or (known[0] if known else CLAIMS[0]), tuple(designs))
 

@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.operating_region import OperatingRegion
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms
 
@@ -37,7 +38,7 @@ def drive_of(
             columns.append(size * np.eye(n + ny)[moving.index(state)])
         else:
             known = (*terms.output_names, *terms.faults, *(f"der({each})" for each in moving))
-            raise SpecError(f"noise names {name!r}; there are: {', '.join(known)}.", path=f"noise.{name}")
+            raise SpecError(f"noise names {name!r}; {there_are(name, known)}", path=f"noise.{name}")
     missing = [name for name in terms.output_names if name not in sizes]
     missing += [name for name in terms.faults if name not in noise_sizes and f"der({name})" not in noise_sizes]
     if missing:

@@ -14,6 +14,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import RankDecision, product_but_rounding, rank_from
 from obsynth.numerics.staircase import full_svd
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
@@ -196,7 +197,7 @@ def fault_numbers(plant: DescriptorSystem, names: Sequence[str], where: str) -> 
     unknown = [name for name in listed if name not in plant.fault_names]
     if unknown:
         raise SpecError(
-            f"{', '.join(map(repr, unknown))}: no such fault; there are: {', '.join(plant.fault_names) or 'none'}.",
+            f"{', '.join(map(repr, unknown))}: no such fault; {there_are(unknown[0], plant.fault_names)}",
             path=where,
         )
     return [plant.fault_names.index(name) for name in dict.fromkeys(listed)]

@@ -15,6 +15,7 @@ from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
 from obsynth.analysis.diagnosis.margins import NEARLY_ALIKE
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.suggestions import there_are
 
 #: With more faults only residuals that are blind to one fault, or see one, are looked for unless all are asked for.
 MOST_PATTERN_FAULTS = 6
@@ -222,7 +223,7 @@ class Diagnosis:
         for fault in self.faults:
             if fault.name == name:
                 return fault
-        raise KeyError(f"no fault named {name!r}; there are: {', '.join(fault.name for fault in self.faults)}")
+        raise KeyError(f"no fault named {name!r}; {there_are(name, [fault.name for fault in self.faults])}")
 
     @property
     def sentences(self) -> tuple[str, ...]:

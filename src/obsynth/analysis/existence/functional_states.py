@@ -14,6 +14,7 @@ from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import numerical_rank
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 
@@ -50,7 +51,7 @@ def chosen_states(states: Any, plant: DescriptorSystem) -> list[int]:
     unknown = [name for name in listed if name not in plant.state_names]
     if unknown:
         raise SpecError(
-            f"{', '.join(map(repr, unknown))}: no such state; there are: {', '.join(plant.state_names)}. For a "
+            f"{', '.join(map(repr, unknown))}: no such state; {there_are(unknown[0], plant.state_names)} For a "
             "combination of states, such as x1 - x2, give the plant functionals: {NAME: {x1: 1, x2: -1}}.",
             path=path,
         )

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.window_models import Bounds, disturbance_names
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
@@ -47,7 +48,7 @@ def free_faults(names: tuple[str, ...], free: Any, fault: int) -> tuple[int, ...
     wrong = [str(name) for name in listed if name not in names or names.index(name) == fault]
     if wrong:
         raise SpecError(
-            f"free names {', '.join(wrong)}: no other fault of the plant is called so; there are: {', '.join(names)}.",
+            f"free names {', '.join(wrong)}: no other fault of the plant is called so; {there_are(wrong[0], names)}",
             path="method.options.free",
         )
     return tuple(sorted({names.index(name) for name in listed}))

@@ -21,6 +21,7 @@ from obsynth.monitoring.logs.signals import mapping_advice, time_advice
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.suggestions import there_are
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,7 +192,7 @@ def read_log(
         wrong = [name for name in mapping if name not in signals]
         if wrong:
             raise SpecError(
-                f"{option} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
+                f"{option} names {wrong[0]!r}, which is no signal; {there_are(wrong[0], signals)}",
                 path=f"{option}.{wrong[0]}",
             )
     held = {name: (columns or {}).get(name, name) for name in signals}
@@ -204,7 +205,7 @@ def read_log(
         wanted = held[name]
         if wanted not in table:
             raise SpecError(
-                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(names)}. {mapping_advice(name)}",
+                f"The log has no column {wanted!r} for {name!r}; {there_are(wanted, names)} {mapping_advice(name)}",
                 path=f"columns.{name}",
             )
         numbers = _numbers(table[wanted], wanted, length)[first:last]

@@ -8,6 +8,7 @@ from typing import Any
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import arguments_checked, shown
 from obsynth.numerics.libraries import imported
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.importing.python_objects import INTEGRATOR_INPUTS, OUTPUTS
 
@@ -113,7 +114,7 @@ def _function(casadi: Any, system: Any) -> Any:
         unknown = [key for key in system if key not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
         if unknown:
             raise SpecError(
-                f"system has the unknown key {unknown[0]!r}; there are: {', '.join((*INTEGRATOR_INPUTS, *OUTPUTS))}.",
+                f"system has the unknown key {unknown[0]!r}; {there_are(unknown[0], (*INTEGRATOR_INPUTS, *OUTPUTS))}",
                 path="system",
             )
         names = [name for name in INTEGRATOR_INPUTS if name in system]

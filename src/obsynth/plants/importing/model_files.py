@@ -17,6 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import READING_ERRORS, path_of, read_text
 from obsynth.numerics.arguments import arguments_checked, number_in_text
 from obsynth.numerics.arrays import FloatArray, require_readable
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.importing.hdf5_models import hdf5_arrays
 from obsynth.plants.importing.roles import plant_of
@@ -290,7 +291,10 @@ def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
     values = {name: record[name] for name in offsets.dtype.names if np.size(record[name])}
     unknown = [name for name in values if name not in (*_OFFSETS, "dx")]
     if unknown:
-        raise SpecError(f"{source}: Offsets has the field {unknown[0]!r}; known are dx, x, u, y.", path=str(source))
+        raise SpecError(
+            f"{source}: Offsets has the field {unknown[0]!r}; {there_are(unknown[0], ('dx', 'x', 'u', 'y'))}",
+            path=str(source),
+        )
     if not _is_at_rest(values.pop("dx", None), values.get("x"), sampled=_is_sampled(fields)):
         raise SpecError(
             f"{source}: by Offsets.dx the operating point is no equilibrium, and deviations from it obey no linear "
@@ -334,7 +338,7 @@ def _seconds_of_unit(fields: Mapping[str, Any], source: Path) -> float:
     text = units[0].lower()
     if len(units) != 1 or text not in _SECONDS_OF_TIME_UNITS:
         raise SpecError(
-            f"{source}: TimeUnit is {units[0]!r}; known are: {', '.join(_SECONDS_OF_TIME_UNITS)}.", path=str(source)
+            f"{source}: TimeUnit is {units[0]!r}; {there_are(units[0], _SECONDS_OF_TIME_UNITS)}", path=str(source)
         )
     return _SECONDS_OF_TIME_UNITS[text]
 

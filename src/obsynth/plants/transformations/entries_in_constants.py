@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.expressions import parse_expression
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.constants import Constant, ConstantsBox, constants_box
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import symbolic_equations
@@ -52,7 +53,7 @@ def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **
     unknown = [name for name in names if name not in known] if isinstance(names, Mapping) else []
     if unknown:
         raise SpecError(
-            f"{unknown[0]!r} is no constant and no parameter of the model; there are {', '.join(known) or 'none'}.",
+            f"{unknown[0]!r} is no constant and no parameter of the model; {there_are(unknown[0], known)}",
             path=f"constants.{unknown[0]}",
         )
     nominal = {name: Constant(name, value, value, value) for name, value in known.items() if name in names}

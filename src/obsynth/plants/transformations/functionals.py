@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, shown
 from obsynth.numerics.sparse import is_sparse
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 
@@ -68,8 +69,8 @@ def with_functionals(
             )
         for state, weight in weights.items():
             if state not in plant.state_names:
-                there = ", ".join(plant.state_names)
-                raise SpecError(f"{name!r} is made of {state!r}, which is no state; there are: {there}.", path=path)
+                there = there_are(state, plant.state_names)
+                raise SpecError(f"{name!r} is made of {state!r}, which is no state; {there}", path=path)
             if not is_finite_number(weight):
                 raise SpecError(f"The weight of {state!r} is {shown(weight)}: give a number.", path=path)
             rows[row, plant.state_names.index(state)] = float(weight)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -155,7 +156,7 @@ def _require_no_state(model: DAEModel, name: str) -> None:
     if name not in model.state_names:
         known = (*model.input_names, *model.parameter_names, *model.constants)
         raise SpecError(
-            f"{name!r} is no input, parameter or constant of the model; there are {', '.join(known) or 'none'}.",
+            f"{name!r} is no input, parameter or constant of the model; {there_are(name, known)}",
             path=f"region.{name}",
         )
     raise PreconditionError(

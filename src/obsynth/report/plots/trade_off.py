@@ -13,6 +13,7 @@ from obsynth.methods.optimal_filter.public import OptimalFilter
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import there_are
 from obsynth.report.plots.panels import (
     LINE_COLOURS,
     PANEL_HEIGHT,
@@ -284,8 +285,7 @@ def _claim(results: Sequence[Any], claim: str | None, along: str | None) -> str:
         varied = "" if along is None else along.rpartition(".")[2]
         return max(counts, key=lambda name: (name != varied, counts[name]))
     if claim is None or claim not in counts:
-        known = ", ".join(counts) or "none"
-        raise SpecError(f"No design of the sweep claims {claim!r}; there are: {known}.", path="claim")
+        raise SpecError(f"No design of the sweep claims {claim!r}; {there_are(claim, counts)}", path="claim")
     return claim
 
 
@@ -296,8 +296,9 @@ def _parameter(results: Sequence[Any], parameter: str | None) -> str | None:
         if all(is_number(value) for value in values):
             numbers[name] = len(set(values))
     if parameter is not None and parameter not in numbers:
-        known = ", ".join(numbers) or "none"
-        raise SpecError(f"{parameter!r} is no number that was varied; there are: {known}.", path="parameter")
+        raise SpecError(
+            f"{parameter!r} is no number that was varied; {there_are(parameter, numbers)}", path="parameter"
+        )
     varied = {name: count for name, count in numbers.items() if count > 1}
     return parameter or max(sorted(varied), key=lambda name: varied[name], default=None)
 

@@ -17,6 +17,7 @@ from obsynth.files.inputs import input_file
 from obsynth.files.outputs import FileKind, made_folder, write_together
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.monitoring.verbs.arguments import MONITOR_NAMES
+from obsynth.numerics.suggestions import there_are
 from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
 from obsynth.report.terminal.output import output_file, print_json, progress, stdout_console
 from obsynth.specs.documents import read_yaml
@@ -53,9 +54,9 @@ def run_sweep(options: argparse.Namespace) -> int:
     def draw(designed: Any) -> Any:
         claims = {name for result in designed.results for name in result.claims}
         if options.claim is not None and options.claim not in claims:
-            known = ", ".join(sorted(claims)) or "none"
+            known = there_are(options.claim, sorted(claims))
             print(
-                f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
+                f"Warning: no picture is written, as no design claims {options.claim!r}; {known}",
                 file=sys.stderr,
             )
             return None
