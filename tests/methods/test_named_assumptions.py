@@ -38,6 +38,62 @@ def test_nothing_exists_only_where_no_method_does(method):
     assert not any(report.passed for name, report in obsynth.check(plant).items() if name == method)
 
 
+def test_what_unknown_inputs_reach_is_not_called_estimated() -> None:
+    """A fault that moves the plant as an unknown input does: the PD observer exists, and estimates both together."""
+    plant = obsynth.DescriptorSystem(A=[[-1, 1], [0, -2]], C=np.eye(2), Bf=[[0], [1]], Bd=np.eye(2))
+    with pytest.raises(obsynth.PreconditionError, match="pd-observer exists, but d1, d2 reach its estimates") as caught:
+        obsynth.functional_filter(plant)
+    assert "can be estimated" not in str(caught.value)
+    design = obsynth.pd_observer(plant)
+    assert design.report.passed
+    static = -np.linalg.solve(plant.A, plant.Bd[:, 1])  # where the plant settles under the unknown input
+    observer = design.linear[1]
+    driven = np.linalg.solve(observer.Az, observer.By @ static)
+    assert abs(observer.Cz[observer.fault_rows] @ -driven + observer.Dy[observer.fault_rows] @ static)[0] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"Bd": [[1.0], [0.0]], "Bw": None, "Dw": None}, "functional_filter with residuals='detect' exists"),
+        ({"Bd": np.eye(2), "Bw": None, "Dw": None}, "State the noise of all sensors"),
+        ({"A": np.diag([1.0, -1.0]), "C": [[0.0, 1.0], [0.0, 2.0]]}, "Measure one of: x1."),
+        ({"A": np.diag([0.0, -1.0])}, "State noise of the states"),
+    ],
+)
+def test_no_assumption_of_the_detection_filter_is_said_to_exclude_others(changes: dict, words: str) -> None:
+    parts = {
+        "A": [[-1, 1], [0, -2]],
+        "C": np.eye(2),
+        "Bf": [[0], [1]],
+        "Bw": np.zeros((2, 2)),
+        "Dw": np.eye(2),
+    } | changes
+    plant = obsynth.DescriptorSystem(**{name: part for name, part in parts.items() if part is not None})
+    with pytest.raises(obsynth.PreconditionError) as caught:
+        obsynth.detection_filter(plant)
+    assert str(caught.value).startswith("This method does not take the plant as it is")
+    assert words in str(caught.value)
+    # What is printed was tried.
+    residuals = {"residuals": "detect"}
+    if "functional_filter" in words:
+        assert obsynth.functional_filter(plant, **residuals).report.passed
+        return
+    if "Measure" in words:
+        plant = obsynth.DescriptorSystem(
+            A=plant.A, C=np.vstack([plant.C, [1.0, 0.0]]), Bf=plant.Bf, Bw=np.zeros((2, 3)), Dw=np.eye(3)
+        )
+    elif "states" in words:
+        plant = plant.replace(
+            Bw=np.hstack([plant.Bw, np.eye(2)]), Dw=np.hstack([plant.Dw, np.zeros((2, 2))]), noise_names=None
+        )
+    else:
+        with pytest.raises(obsynth.PreconditionError):
+            obsynth.functional_filter(plant, **residuals)
+        plant = plant.replace(Bw=np.zeros((2, 2)), Dw=np.eye(2), noise_names=None)
+    assert obsynth.detection_filter(plant).report.passed
+
+
 def _spring() -> obsynth.PolytopicSystem:
     return obsynth.PolytopicSystem(
         plant={

@@ -8,6 +8,7 @@ u the unit roundoff, in any units; the observer's own numbers, with z its state,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,9 @@ MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
 
 #: Methods that estimate every state beside the faults.
 _OF_THE_WHOLE_STATE = ("pd-observer", "ui-pi-observer")
+
+#: Methods whose estimates unknown inputs reach, by a bounded gain.
+_DISTURBED = ("fault-estimation-filter", "pd-observer")
 
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
@@ -113,7 +117,7 @@ def with_advice(
     if not plant.nf and error.condition == "faults":
         # No sensor makes a fault of none.
         return error
-    candidates = state_sensors(plant) if sensors is None else sensors
+    candidates = _as_noisy_as_others(plant, state_sensors(plant)) if sensors is None else sensors
     sets = least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
         text = f"Measure one of: {listed_sets(sets)}."
@@ -133,6 +137,14 @@ def with_advice(
     )
 
 
+def _as_noisy_as_others(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> Sequence[Sensor]:
+    """Return sensors with noise of the usual size, where every sensor of the plant has noise of its own."""
+    deviations = np.linalg.norm(plant.Dw, axis=1)
+    if not plant.ny or not np.all(deviations > 0.0):
+        return sensors
+    return [replace(sensor, deviation=float(np.median(deviations))) for sensor in sensors]
+
+
 def _named_assumption(error: PreconditionError, plant: DescriptorSystem, method: Method) -> PreconditionError:
     """Return the refusal as one of this method alone where others estimate the faults of the plant: they are named."""
     text = without_opening(str(error))
@@ -145,19 +157,34 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, method:
         alternatives = [name for name in alternatives if name in _OF_THE_WHOLE_STATE]
     if not alternatives:
         return error
-    exist = "exists" if len(alternatives) == 1 else "exist"
+    estimated = _with_alternatives(plant, alternatives, states=states)
     return PreconditionError(
-        f"{method.id} assumes more than this plant has: {text} "
-        + (
-            f"The states can be estimated beside faults that follow their models: {', '.join(alternatives)} {exist}."
-            if states
-            else f"The {'faults' if plant.nf else 'states'} can be estimated: {', '.join(alternatives)} {exist}."
-        ),
+        f"{method.id} assumes more than this plant has: {text} {estimated}",
         condition=error.condition,
         mode=error.mode,
         signals=error.signals,
         unclear=error.unclear,
     )
+
+
+def _with_alternatives(plant: DescriptorSystem, names: Sequence[str], *, states: bool) -> str:
+    """Return what other methods estimate: what unknown inputs reach is not said to be estimated without more."""
+    disturbed = [name for name in names if plant.nd and name in _DISTURBED]
+    free = [name for name in names if name not in disturbed]
+    sentences = []
+    if free and states:
+        sentences.append(f"The states can be estimated beside faults that follow their models: {_exist(free)}.")
+    elif free:
+        sentences.append(f"The {'faults' if plant.nf else 'states'} can be estimated: {_exist(free)}.")
+    if disturbed:
+        reached = "its estimates" if len(disturbed) == 1 else "their estimates"
+        inputs = f"{', '.join(plant.disturbance_names)} reach{'es' if plant.nd == 1 else ''}"
+        sentences.append(f"{'Also ' if free else ''}{_exist(disturbed)}, but {inputs} {reached}.")
+    return " ".join(sentences)
+
+
+def _exist(names: Sequence[str]) -> str:
+    return f"{', '.join(names)} exist{'s' if len(names) == 1 else ''}"
 
 
 def _methods_for_faults(own: Method) -> list[str]:

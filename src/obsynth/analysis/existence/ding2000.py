@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.existence import functional_filter
 from obsynth.analysis.existence.condition import Condition, rank_condition
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.errors import PreconditionError
@@ -74,16 +77,28 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
         )
     reading = reading_outputs(smooth)
     reach = decide_rank(unknown_inputs(smooth)[1][reading], expected=len(reading))
-    remedy = (
-        "Unknown inputs and noise do not reach every output directly ([Dd, Dw] lacks row rank): some residual is free "
-        "of them at high frequencies. Ask functional_filter for residuals, or state the noise of all sensors."
-    )
+    remedy = "" if reach.full else _without_full_rank(plant)
+    direct = rank_condition("rank [Dd, Dw]", reach, remedy, source=_SOURCE, signals=smooth.output_names)
     return (
         *first,
-        rank_condition("rank [Dd, Dw]", reach, remedy, source=_SOURCE, signals=smooth.output_names),
-        _detectable(smooth),
-        *(_no_zero_on_the_axis(plant) if reach.full else ()),
+        *(
+            # Where one fails the optimum is not attained, or has no such filter: other residuals exist.
+            replace(condition, of_the_method=True)
+            for condition in (direct, _detectable(smooth), *(_no_zero_on_the_axis(plant) if reach.full else ()))
+        ),
     )
+
+
+def _without_full_rank(plant: DescriptorSystem) -> str:
+    """Return what is so where unknown inputs and noise do not reach every output at once, and what can be done."""
+    text = (
+        "Unknown inputs and noise do not reach every output directly ([Dd, Dw] lacks row rank): some residual is free "
+        "of them at high frequencies. "
+    )
+    residuals = functional_filter.conditions(plant, residuals="detect", exactly=False)
+    if all(condition.holds for condition in residuals):
+        return f"{text}functional_filter with residuals='detect' exists; or state the noise of all sensors."
+    return f"{text}State the noise of all sensors (sensor_noise)."
 
 
 def reading_outputs(plant: DescriptorSystem) -> NDArray[np.intp]:
