@@ -108,7 +108,8 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
                              seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts,
-                             repeats=np.full(len(design.plant.output_names), 3.0), ranges=ranges)  # fmt: skip
+                             repeats=np.full(len(design.plant.output_names), 3.0), ranges=ranges,
+                             memory=40.0 if estimates else 0.0)  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

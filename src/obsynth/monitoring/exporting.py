@@ -13,9 +13,9 @@ from obsynth.errors import SpecError
 from obsynth.exporting.alarms import STATISTIC, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
-from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
-from obsynth.monitoring.thresholds.learned_rule import LearnedRule
+from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, LearnedRule, follow_shares
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
@@ -80,13 +80,15 @@ class LearnedMonitorInC:
             f"    REAL past[{max(model.order * m, 1)}];",
             f"    REAL white[{max(AGES) * m}];",
             f"    REAL means[{len(FORGETTING) * m}];",
+            f"    REAL slow[{m}];",
             f"    REAL before[{(1 + width) * width}];",
             f"    REAL scores[{max(AGES) * 2 * width}];",
+            f"    REAL centres[{width}];",
             f"    REAL repeated[{max(self.outputs, 1)}];",
             f"    long equal[{max(self.outputs, 1)}];",
             f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
             f"    REAL raised_now[{max(inputs, 1)}];",
-            "    int at, quiet, to_wait;",
+            "    int at, quiet, to_wait, alarmed;",
             "    long taken;",
             f"}} {prefix}_monitor;",
             "",
@@ -107,6 +109,7 @@ class LearnedMonitorInC:
         listed = ", ".join(f"{name} = {value}" for name, value in self._sizes().items())
         lines = [
             f"enum {{ {listed} }};",
+            *(f"#define {name} ((REAL){value!r})" for name, value in self._follow_numbers().items()),
             f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
             f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
             f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
@@ -140,6 +143,12 @@ class LearnedMonitorInC:
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
+
+    def _follow_numbers(self) -> dict[str, float]:
+        """Return how an offset of residuals is followed, by the names of the numbers in C."""
+        usual, in_alarm = follow_shares(self.learned.memory)
+        names = ("MONITOR_FOLLOW", "MONITOR_FOLLOW_IN_ALARM", "MONITOR_FOLLOWED_MOST", "MONITOR_FAULTS_SLOWER")
+        return dict(zip(names, (usual, in_alarm, FOLLOWED_MOST, FAULTS_SLOWER), strict=True))
 
     def _tables(self) -> dict[str, Any]:
         """Return the numbers of the thresholds, by their names in C."""

@@ -16,8 +16,14 @@ static void monitor_reset(PREFIX_monitor *m)
     for (i = 0; i < MEANS * CHANNELS; i++) {
         m->means[i] = 0;
     }
+    for (i = 0; i < CHANNELS; i++) {
+        m->slow[i] = 0;
+    }
     for (i = 0; i < (1 + MONITOR_WIDTH) * MONITOR_WIDTH; i++) {
         m->before[i] = NAN;
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        m->centres[i] = monitor_centres[0][i];
     }
     for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
         m->scores[i] = 0;
@@ -36,7 +42,7 @@ static void monitor_reset(PREFIX_monitor *m)
     m->taken = 0;
     m->to_wait = 0;
     m->statistic = NAN;
-    m->alarm = m->event = m->quiet = 0;
+    m->alarm = m->event = m->quiet = m->alarmed = 0;
     m->fault = -1;
 }
 
@@ -163,6 +169,14 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x, const REAL *kept, REAL
     size = (REAL)sqrt(size);
     for (i = 0; size > most && i < CHANNELS; i++) {
         e[i] *= most / size;
+    }
+    /* Follow a slow offset, by no more than noise moves it; more slowly in an alarm. */
+    for (i = 0; MONITOR_FOLLOW > 0 && x != NULL && most > 0 && i < CHANNELS; i++) {
+        REAL away = e[i] - m->slow[i];
+        e[i] = away;
+        away = away > MONITOR_FOLLOWED_MOST ? MONITOR_FOLLOWED_MOST : away;
+        away = away < -MONITOR_FOLLOWED_MOST ? -MONITOR_FOLLOWED_MOST : away;
+        m->slow[i] += (m->alarmed ? MONITOR_FOLLOW_IN_ALARM : MONITOR_FOLLOW) * (isnan(away) ? 0 : away);
     }
     for (k = 0; k < MEANS; k++) {
         for (i = 0; i < CHANNELS; i++) {
@@ -294,8 +308,8 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
     for (i = 0; says && any && i < MONITOR_ESTIMATES; i++) {
         for (j = 0; j < MONITOR_ESTIMATES; j++) {
             int at = i * MONITOR_WIDTH + j;
-            row[i] += own[at] * (theta[j] - monitor_centres[0][j]);
-            row[i] -= prior[at] * (m->before[j] - monitor_centres[0][j]);
+            row[i] += own[at] * (theta[j] - m->centres[j]);
+            row[i] -= prior[at] * (m->before[j] - m->centres[j]);
         }
         row[MONITOR_WIDTH + i] = own[i * MONITOR_WIDTH + i] - prior[i * MONITOR_WIDTH + i];
     }
@@ -304,6 +318,22 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
         for (j = 0; j < MONITOR_ESTIMATES; j++) {
             m->before[MONITOR_WIDTH + i * MONITOR_WIDTH + j] = covariance[i * MONITOR_WIDTH + j];
         }
+    }
+}
+
+/* Let the centres of the faults follow the estimates. */
+static void monitor_centre(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
+{
+    int i;
+    for (i = 0; MONITOR_FOLLOW > 0 && covariance != NULL && i < MONITOR_ESTIMATES; i++) {
+        REAL deviation = (REAL)sqrt(covariance[i * (MONITOR_WIDTH + 1)]);
+        REAL away = (theta[i] - m->centres[i]) / deviation;
+        REAL moved;
+        away = away > MONITOR_FOLLOWED_MOST ? MONITOR_FOLLOWED_MOST : away;
+        away = away < -MONITOR_FOLLOWED_MOST ? -MONITOR_FOLLOWED_MOST : away;
+        moved = m->centres[i]
+            + (m->alarmed ? MONITOR_FOLLOW_IN_ALARM : MONITOR_FOLLOW) / MONITOR_FAULTS_SLOWER * away * deviation;
+        m->centres[i] = isfinite(moved) ? moved : m->centres[i];
     }
 }
 
@@ -410,6 +440,9 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     is_said = is_whole || (innovation >= 0 && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
+    if (deciding && m->taken > MONITOR_SETTLING) {
+        monitor_centre(m, shown, covariance);
+    }
     for (i = 0; i < MONITOR_INPUTS; i++) {
         m->raised[m->at * MONITOR_INPUTS + i] = m->raised_now[i];
         m->raised_now[i] = 1;
@@ -436,7 +469,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         }
         changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
-            REAL away = beyond(shown[i] - monitor_centres[0][i], monitor_bands[0][i]);
+            REAL away = beyond(shown[i] - m->centres[i], monitor_bands[0][i]);
             ratio = changes[i] / levels[1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
             if (covariance != NULL) {
@@ -447,6 +480,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         }
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
+        m->alarmed = m->alarm;
     }
     if (m->alarm) {
         m->fault = MONITOR_ESTIMATES > 0 ? changed : monitor_told[which % (SHAPES / 2)];

@@ -60,6 +60,10 @@ class WrongPairs(NamedTuple):
 NO_PAIRS = WrongPairs(0, 0.0)
 
 
+#: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
+FAULTS_SLOWER = 2.0
+
+
 @dataclass(frozen=True, eq=False)
 class LearnedThresholds:
     """Thresholds learned from rows without faults; made by `obsynth.learn_thresholds`.
@@ -116,6 +120,9 @@ class LearnedThresholds:
     drift_limits : mapping of str to float
         Of one log, where no drift is allowed for: by how many deviations of its noise, below one, a slow drift of a
         sensor alarms for as long as it lasts.
+    memory : float
+        Rows over which slow offsets of the residuals are followed, and twice those over which faults are, so that they
+        alarm nothing; zero: none is.  One log does not distinguish drifts of a plant from faults that come as slowly.
     ranges : LearnedRanges, optional
         Least and largest values of inputs and outputs in these rows: beyond those of an input levels are raised.
     notes : tuple of str
@@ -165,6 +172,7 @@ class LearnedThresholds:
     without_drift: tuple[str, ...] = ()
     drift_limits: Mapping[str, float] = field(default_factory=dict)
     ranges: LearnedRanges | None = None
+    memory: float = 0.0
 
     @property
     def holds(self) -> bool:
@@ -212,6 +220,12 @@ class LearnedThresholds:
             yield (
                 "one log does not say how far constants of the plant drift in others: while one is further off than in "
                 "this log, healthy rows may be in alarm; three normal logs that hold such drifts show it"
+            )
+        if self.memory:
+            yield (
+                "one log does not distinguish slow faults from drifts: offsets of the residuals that come over more "
+                f"than about {self.memory:.6g} rows ({duration(self.memory * self.dt)}), and changes of the faults "
+                f"over more than {FAULTS_SLOWER * self.memory:.6g}, are followed and alarm nothing"
             )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)
@@ -295,6 +309,7 @@ class LearnedThresholds:
             "without_drift": list(self.without_drift),
             "drift_limits": dict(self.drift_limits),
             "ranges": None if self.ranges is None else self.ranges.as_dict(),
+            **({"memory": self.memory} if self.memory else {}),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -433,4 +448,5 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         tuple(map(str, data.get("without_drift", ()))),
         {str(name): float(limit) for name, limit in data.get("drift_limits", {}).items()},
         None if data.get("ranges") is None else LearnedRanges.from_dict(data["ranges"]),
+        real_number(data.get("memory", 0.0), "memory", "rows, 0 or more", least=0.0),
     )

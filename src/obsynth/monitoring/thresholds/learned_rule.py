@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
 from obsynth.monitoring.thresholds.hypotheses import ranked, ranked_changes
-from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.parameter_scores import (
@@ -35,6 +35,12 @@ from obsynth.results.gain_set_writing import digest_of, gain_set_digest, plain
 
 NOTHING = read_only(np.zeros(0))
 
+#: Deviations by which a row moves the offset that is followed, at most: a wrong sample says no more than others.
+FOLLOWED_MOST = 3.0
+
+#: While a level is passed the offset is followed so many times more slowly: what has come quickly stays an alarm.
+SLOWER_IN_ALARM = 10.0
+
 
 class LearnedState(NamedTuple):
     """The state of `LearnedRule`."""
@@ -48,7 +54,15 @@ class LearnedState(NamedTuple):
     before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
     scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
     effects: EffectState = NO_EFFECTS  # of faults and sensors on the residuals
+    slow: FloatArray = NOTHING  # ``(m,)``: the offset of whitened rows that is followed
+    centres: FloatArray = NOTHING  # ``(nf,)``: the faults from which changes are looked for
+    alarmed: int = 0  # whether the latest row that was decided passed a level
     raised: FloatArray = NOTHING  # ``(ages, nu)``: how far beyond their ranges the inputs of rows are, latest last
+
+
+def follow_shares(memory: float) -> tuple[float, float]:
+    """Return by which share of a row the offset of residuals follows it, and by which while there is an alarm."""
+    return (1.0 / memory, 1.0 / (SLOWER_IN_ALARM * memory)) if memory else (0.0, 0.0)
 
 
 class LearnedRule(Rule):
@@ -61,7 +75,10 @@ class LearnedRule(Rule):
     observer's own covariance, which has grown, makes of their innovation, by as much as it was wrong in the rows that
     were learned from.  In that row itself the innovations of
     ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
-    likely."""
+    likely.
+
+    With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
+    exponential means follow them, ten times more slowly after a row in alarm."""
 
     def __init__(
         self,
@@ -88,6 +105,7 @@ class LearnedRule(Rule):
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
         self._ranges = learned.ranges
+        self._shares = follow_shares(learned.memory)
 
     def init(self) -> LearnedState:
         """Return the state before the first sample."""
@@ -96,11 +114,15 @@ class LearnedRule(Rule):
         effects = NO_EFFECTS if self.effects is None else self.effects.init()
         inputs = 0 if self._ranges is None else self._ranges.inputs
         state = LearnedState(
-            np.tile(model.mean, (model.order, 1)), white, means, effects=effects, raised=np.ones((max(AGES), inputs))
-        )
+            np.tile(model.mean, (model.order, 1)), white, means, effects=effects, slow=np.zeros(model.channels),
+            raised=np.ones((max(AGES), inputs)),
+        )  # fmt: skip
         if self._walk is None:
             return state
-        return state._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
+        return state._replace(
+            before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))),
+            centres=self.learned.centres,
+        )  # fmt: skip
 
     def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
@@ -109,6 +131,8 @@ class LearnedRule(Rule):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
         state = self._scored(state, sample.observation, max(missing, 0))
+        if sample.deciding and state.taken > self.learned.settling:
+            state = self._centred(state, sample.observation)
         state = state._replace(raised=self._raised(state.raised, sample, max(missing, 0)))
         values_of_row = watched_values(sample.residuals, sample.observation)
         complete = values_of_row is not None and sample.deciding and bool(np.isfinite(values_of_row[self._usual]).all())
@@ -147,10 +171,11 @@ class LearnedRule(Rule):
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
             changes = self._changes(state, self._bands)
-            squares = self._squares(sample.observation)
+            squares = self._squares(state, sample.observation)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
             values = values / (self.learned.levels * self._factors(state))
         values = np.where(np.isnan(values), np.inf, values)
+        state = state._replace(alarmed=int(values.max() > 1.0))
         # Faults are compared without what their slow offsets explain: each has its own.
         fault = (
             self._fault(values_of_row, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
@@ -193,10 +218,20 @@ class LearnedRule(Rule):
         if self._walk is None or not isinstance(observation, Evidence):
             return state
         before, scores = sample_score(state.before, observation, self._walk, missing + 1)
-        row = np.concatenate([scores.away(self.learned.centres), np.diag(scores.information)])
+        row = np.concatenate([scores.away(state.centres), np.diag(scores.information)])
         gone = min(missing, max(AGES))
         newest_scores = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
         return state._replace(before=before, scores=newest_scores)
+
+    def _centred(self, state: LearnedState, observation: Any) -> LearnedState:
+        """Return the state whose centres of the faults have followed the estimates."""
+        if self._walk is None or not self._shares[0] or not isinstance(observation, Evidence):
+            return state
+        deviations = np.sqrt(np.diag(observation.parameter_covariance))
+        with np.errstate(all="ignore"):
+            away = np.clip((observation.theta - state.centres) / deviations, -FOLLOWED_MOST, FOLLOWED_MOST)
+            moved = state.centres + self._shares[state.alarmed] / FAULTS_SLOWER * away * deviations
+        return state._replace(centres=np.where(np.isfinite(moved), moved, state.centres))
 
     def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
         """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,
@@ -209,11 +244,11 @@ class LearnedRule(Rule):
         with np.errstate(all="ignore"):
             return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
 
-    def _squares(self, observation: Any) -> FloatArray:
+    def _squares(self, state: LearnedState, observation: Any) -> FloatArray:
         """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
         if self._walk is None or not isinstance(observation, Evidence):
             return np.zeros(0 if self._walk is None else len(self._walk))
-        away = beyond(observation.theta - self.learned.centres, self._bands)
+        away = beyond(observation.theta - state.centres, self._bands)
         return np.asarray(away**2 / np.diag(observation.parameter_covariance))
 
     def _fault(self, watched: FloatArray, ratios: FloatArray) -> int | None:
@@ -263,10 +298,15 @@ class LearnedRule(Rule):
             e = np.zeros(model.channels) if evidence is None or not most else model.whitener @ (evidence - predicted)
             size = float(np.linalg.norm(e))
             e = e * (most / size) if size > most else e
+        slow = state.slow
+        if self._shares[0] and evidence is not None and most:
+            e = e - slow
+            # A wrong sample moves the offset no more than noise does.
+            slow = slow + self._shares[state.alarmed] * np.clip(np.nan_to_num(e), -FOLLOWED_MOST, FOLLOWED_MOST)
         shares = np.array(FORGETTING)[:, None]
         past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
         means = (1.0 - shares) * state.means + shares * e
-        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means)
+        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means, slow=slow)
 
     def restart(self, state: LearnedState, skipped: int = 0) -> LearnedState:
         """Keep everything: rows that are missing are predicted over."""

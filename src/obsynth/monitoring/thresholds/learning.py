@@ -21,6 +21,7 @@ from obsynth.monitoring.thresholds.learned_from_rows import (
     watched_rows,
 )
 from obsynth.monitoring.thresholds.learned_ranges import LearnedRanges, ranges_of_rows
+from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.normal_logs import NormalLogs, read_normal_logs
 from obsynth.monitoring.thresholds.normal_notes import (
     notes_of_left_out,
@@ -52,6 +53,10 @@ from obsynth.results.design import ObserverDesign
 
 #: One false alarm in so many rows, where nothing else is asked for.
 FALSE_ALARM_RATE = "1 per 1000 rows"
+
+#: Rows over which offsets of residuals are followed where one log does not tell them from drifts: half as many again as
+#: the oldest change that statistics look for, of which three quarters remain.
+FOLLOWED_ROWS = 1.5 * max(AGES)
 
 #: Deviations of its noise by which each sensor may drift, where nothing else is asked for.
 SENSOR_DRIFT = 0.0
@@ -174,7 +179,8 @@ def learn_thresholds(
     )
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
-    is_one_log = drifts is None and len(logs.ends) == 1
+    learned = replace(learned, memory=_memory(learned, logs))
+    stays = drifts is None and len(logs.ends) == 1 and not learned.memory
     return replace(
         learned,
         notes=(
@@ -184,9 +190,15 @@ def learn_thresholds(
             *_notes_of_starts(design, output, learned),
         ),
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
-        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if is_one_log else {},
+        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if stays else {},
         ranges=_ranges(signals, deviations, output, white, learned, options["logs"]),
     )
+
+
+def _memory(learned: LearnedThresholds, logs: NormalLogs) -> float:
+    """Return over how many rows slow offsets of residuals are followed: where one log does not tell them from drifts,
+    and changes of faults are watched beside them."""
+    return FOLLOWED_ROWS if len(logs.ends) == 1 and learned.statistics.estimates else 0.0
 
 
 def _notes_of_output(

@@ -1,0 +1,89 @@
+"""Thresholds of one log: slow offsets of residuals and slow changes of faults are followed, quick ones alarm."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+
+DT, ROWS, NOISE, AT = 0.1, 1_500, 0.1, 700
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
+
+@functools.cache
+def design() -> obsynth.ObserverDesign:
+    """Return a tank whose pump loses a share of its flow."""
+    model = obsynth.DAEModel(
+        {"tank": "der(h) = 10 * (1 - f) * u - h"}, {"y": "h"}, states={"h": 0.0}, inputs={"u": 0.0},
+        parameters={"f": 0.0},
+    )  # fmt: skip
+    return obsynth.dae_adaptive_observer(
+        model, dt=DT, Q=[[1e-4]], R=[[0.01]], form="augmented-kalman", random_walk=[[1e-4]],
+        initial_covariance=[[0.01]], initial_parameter_covariance=[[0.01]],
+    )  # fmt: skip
+
+
+def log(seed: int, *, rows: int = ROWS, offset: str = "", size: float = 0.0, fault: float = 0.0) -> pd.DataFrame:
+    """Return a log whose sensor drifts over all rows or jumps, and whose pump loses a share, both from a row on."""
+    rng, h, found = np.random.default_rng(seed), 0.0, []
+    for k in range(rows):
+        u, f = 0.2 * (-1.0) ** (k // 3), fault * (k >= AT)
+        h = (h + DT * 10.0 * (1.0 - f) * u) / (1.0 + DT) + 0.01 * rng.standard_normal()
+        off = size * (k / rows if offset == "drift" else float(k >= AT and offset == "jump"))
+        found.append([k * DT, u, h + off + NOISE * rng.standard_normal()])
+    return pd.DataFrame(found, columns=["time", "u", "y"])
+
+
+@functools.cache
+def learned() -> obsynth.types.LearnedThresholds:
+    return obsynth.learn_thresholds(design(), log(0), false_alarms="1 per 500 rows")
+
+
+def alarms(data: pd.DataFrame, memory: float) -> np.ndarray:
+    """Return which rows are in alarm where offsets are followed over so many rows."""
+    monitor = obsynth.online_monitor(design(), "learned", normal=replace(learned(), memory=memory))
+    return obsynth.run_on_data(design(), data, monitor=monitor).table["alarm"].ne("").to_numpy()
+
+
+@pytest.mark.long
+def test_a_slow_drift_alarms_nothing_and_a_jump_stays_an_alarm() -> None:
+    """A drift of .8 deviations of the sensor, which no fault explains, was an alarm for most of a healthy log."""
+    memory = learned().memory
+    assert memory == 300.0
+    drift = log(1, offset="drift", size=0.8 * NOISE)
+    assert alarms(drift, 0.0).mean() > 0.2
+    assert alarms(drift, memory).mean() < 0.02
+    jump = log(2, offset="jump", size=4.0 * NOISE)
+    for found in (alarms(jump, 0.0), alarms(jump, memory)):
+        assert not found[:AT].any()
+        assert found[AT:].argmax() < 5
+        assert found[AT:].mean() > 0.5
+
+
+@pytest.mark.long
+def test_a_fault_that_comes_at_once_is_found_as_soon() -> None:
+    delays = [int(alarms(log(3, fault=0.3), memory)[AT:].argmax()) for memory in (0.0, learned().memory)]
+    assert delays[0] > 0
+    assert delays[1] <= delays[0] + 5
+
+
+@pytest.mark.long
+def test_one_wrong_sample_moves_what_is_followed_no_more_than_noise_does() -> None:
+    data = log(4)
+    data.loc[600, "y"] += 1e6
+    assert not alarms(data, learned().memory)[900:].any()
+
+
+@pytest.mark.long
+def test_several_logs_show_drifts_themselves_and_nothing_is_followed(tmp_path: Path) -> None:
+    several = obsynth.learn_thresholds(design(), [log(k, rows=600) for k in range(3)], false_alarms="1 per 500 rows")
+    assert several.memory == 0.0
+    assert "followed" not in several.statement
+    assert "are followed and alarm nothing" in learned().statement
+    assert obsynth.load_thresholds(learned().save(tmp_path / "t.json")).memory == 300.0
