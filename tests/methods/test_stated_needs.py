@@ -11,6 +11,7 @@ import yaml
 
 import obsynth as ob
 from obsynth.cli.main import main
+from obsynth.methods.registry import method_class
 
 LINEAR = ob.DescriptorSystem(
     np.diag([1.0, 1.0, 0.0]),
@@ -83,6 +84,20 @@ def test_check_tells_what_is_not_stated(plant: Any, method: str, options: dict[s
 def test_what_is_stated_is_enough(plant: Any, method: str, options: dict[str, Any]) -> None:
     assert ob.check(plant, {method: options})[method].passed
     assert ob.design(plant, method, **options).report.passed
+
+
+def test_large_plants_have_the_answer_of_a_design() -> None:
+    # Of more than 60 states no gains were formed: the filter was said to exist.
+    states = 61
+    method = method_class("descriptor-kalman").of({"Q": 0.0, "R": 0.1, "initial_covariance": 0.0})
+    growing, decaying = (
+        ob.DescriptorSystem(A=np.diag([factor, *np.full(states - 1, 0.5)]), C=np.eye(states)[:2], dt=1.0)
+        for factor in (1.5, 0.5)
+    )
+    assert all(condition.holds for condition in method.existence(growing))
+    with pytest.raises(ob.PreconditionError, match="Errors do not decay"):
+        method.require_stated(growing)
+    method.require_stated(decaying)
 
 
 def test_a_question_without_options_is_one_about_the_plant() -> None:

@@ -16,9 +16,11 @@ from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, a
 from obsynth.errors import PreconditionError, counted
 from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import covariance_factor, decide_rank
 from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
+    CLEARLY_STABLE,
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
     gain_schedule_summary,
@@ -34,7 +36,8 @@ from obsynth.results.design import Certificate
 
 #: Information on the parameters in a window below this share of their prior's is as good as none.
 LOST_EXCITATION = 1.0
-#: `check` forms gains of plants of at most so many states: of 196 states it takes two seconds.
+#: Of plants of more states gains are formed only where their steady state is not sure: of 196 states it takes two
+#: seconds.
 MOST_STATES_TO_FORM_GAINS = 60
 
 
@@ -59,17 +62,27 @@ def synthesise(
 def require_gains(plant: DescriptorSystem | TimeVaryingDescriptorSystem, method: Method) -> None:
     """Raise `PreconditionError` where the noise as stated allows no gains, or none with which errors decay.
 
-    Asked where some equation or output has no noise; where all have, the conditions of existence decide.  Of plants of
-    many states it is asked by a design only: gains are formed step by step, which takes seconds.
+    Gains are formed where some equation or output has no noise; where all have, the conditions of existence decide.
+    Of a plant of many states that decays by itself, with noise in every output, the filter has a steady state.
     """
     options = method.as_given()
     if shared_noise(plant, Q=options["Q"], R=options["R"]) is None:
         options = with_stated_noise(plant, options)
         if all(options[name] is None or _is_definite(options[name]) for name in ("Q", "R")):
             return
-    if plant.nx > MOST_STATES_TO_FORM_GAINS:
-        return
+        if plant.nx > MOST_STATES_TO_FORM_GAINS and _decays_by_itself(plant, options):
+            return
     synthesise(plant, method, progress=lambda _: None)
+
+
+def _decays_by_itself(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> bool:
+    """Whether the model of a filter without parameters or unknown inputs decays, with noise in every output: errors of
+    the filter then decay, whatever Q and the first covariance are."""
+    if "form" in options or options["early_constraints"] or not isinstance(plant, DescriptorSystem) or plant.nd:
+        return False
+    if (options["R"] is not None and not _is_definite(options["R"])) or not decide_rank(plant.E).full:
+        return False
+    return spectral_radius(np.asarray(np.linalg.solve(plant.E, plant.A), dtype=np.float64)) < CLEARLY_STABLE
 
 
 def _is_definite(covariance: Any) -> bool:
