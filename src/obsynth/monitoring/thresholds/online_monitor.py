@@ -11,12 +11,13 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
+from obsynth.monitoring.thresholds.continuous_region_bounds import continuous_region_bound
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, gap_growth
 from obsynth.monitoring.thresholds.guaranteed import data_monitor
 from obsynth.monitoring.thresholds.learned import LearnedThresholds, load_thresholds
 from obsynth.monitoring.thresholds.learned_rule import learned_monitor
 from obsynth.monitoring.thresholds.learning import learn_thresholds
-from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
+from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, STATEMENTS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.region_bounds import region_bound
@@ -42,6 +43,7 @@ from obsynth.plants.noise import is_noise_assumed, require_noise
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.assumptions import Assumptions
+from obsynth.verification.error_system import ErrorModel
 
 _AFTER_WARM_UP = "; it holds once the initial-condition response has settled (the warm-up)"
 
@@ -55,6 +57,13 @@ _FROM_THE_FIRST_INSIDE = "; from the first row on; after gaps, and after rows ou
 
 #: A note of every monitor whose noise is none that somebody stated.
 NOISE_ASSUMED = "; noise of deviation 1 is assumed on every sensor, as none is stated"
+
+#: Of a design over a region in continuous time.
+_MOVING = (
+    ", for every course of {names} in the region; disturbances move within their bounds between rows, known inputs and "
+    "{names} stay between their values at both; the threshold follows the rows, as what a step from one to the next "
+    "misses of the plant's motion does"
+)
 
 _GROWS = "; after missing outputs it is larger by the possible error of the plant's model"
 
@@ -242,6 +251,32 @@ def _over_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
             f"{stated[0]} is not for designs over a region: give disturbance_bounds, noise_bound and initial_error.",
             path=stated[0],
         )
+    if design.scheduled[0].is_discrete:
+        return _over_sampled_region(design, options)
+    return _over_continuous_region(design, options)
+
+
+def _over_continuous_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
+    noise_bound, start = options["noise_bound"], options["initial_error"]
+    found = continuous_region_bound(design, options["disturbance_bounds"], noise_bound, start)
+    _require_above("pointwise", found.limit, found.errors, found.C, found.bounds)
+    plant, observer = design.scheduled
+    first, names = plant.vertices[0], ", ".join(plant.scheduling.names)
+    assumed = Assumptions(first, found.bounds, noise_bound or 0.0, initial_error=start).bounds_phrase
+    return Monitor(
+        "pointwise",
+        f"{STATEMENTS['pointwise']}{f', with {assumed}' if assumed else ''}{_MOVING.format(names=names)}"
+        + (_AFTER_OUT if start is None else _FROM_THE_FIRST_INSIDE)
+        + (NOISE_ASSUMED if is_noise_assumed(first.noise_names) else "")
+        + NO_TOLERANCE,
+        found.rule,
+        residuals=len(observer.residual_names),
+        fault_names=observer.fault_names,
+        fault_scales=found.fault_scales,
+    )
+
+
+def _over_sampled_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
     noise_bound, start = options["noise_bound"], options["initial_error"]
     (table, limit), model, bounds = region_bound(design, options["disturbance_bounds"], noise_bound, start)
     require_noise(noise_bound, noisy=model.noisy)
@@ -299,10 +334,13 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
 
 def _require_above_rounding(kind: str, limit: float, model: ResidualModel, bounds: FloatArray) -> None:
     """Refuse a bound that rounding of what it is made of would pass: of disturbances that cancel."""
-    plant = model.errors.plant
+    _require_above(kind, limit, model.errors, model.C, bounds)
+
+
+def _require_above(kind: str, limit: float, errors: ErrorModel, C: FloatArray, bounds: FloatArray) -> None:
     # They come by the states, of which a row may show others than those that they enter.
-    into_error = np.abs(model.errors.own) @ np.abs(plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
-    size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(into_error))
+    into_error = np.abs(errors.own) @ np.abs(errors.plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
+    size = float(np.linalg.norm(C, 2) * np.linalg.norm(into_error))
     if not limit > RESIDUAL_ROUNDING_SHARE * size:
         raise SpecError(
             "As stated, no disturbance reaches the residual, and (66) bounds nothing else: use pointwise, which bounds "

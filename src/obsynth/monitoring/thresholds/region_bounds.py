@@ -100,7 +100,7 @@ def _errors_at_vertices(
     design: ObserverDesign, disturbance_bounds: Mapping[str, float] | None, noise_bound: float | None
 ) -> tuple[ErrorsAtVertices, ResidualModel, FloatArray]:
     plant, observer = design.scheduled
-    _require_supported(design, observer)
+    _require_certificate(design)
     made, model, bounds = [], None, np.zeros(0)
     for place, vertex in enumerate(plant.vertices):
         own = design.replace(plant=vertex, observer=observer.before_division(place))
@@ -143,19 +143,11 @@ def _corrected(
     return ErrorsAtVertices(means(free, M), means(free, B), means(same, M), means(same, B), corrections, first)
 
 
-def _require_supported(design: ObserverDesign, observer: ScheduledObserver) -> None:
-    problem = ""
-    if observer.dt == 0.0:
-        problem = (
-            "is continuous in time, and what a step of implicit Euler between rows misses of the plant's own motion "
-            "has no bound that is stated"
-        )
-    elif not {"tracking", WITNESSES[0]} <= set(design.certificate.matrices):
-        problem = "has no certificate of decay"
-    if problem:
+def _require_certificate(design: ObserverDesign) -> None:
+    if not {"tracking", WITNESSES[0]} <= set(design.certificate.matrices):
         raise SpecError(
-            f"Design {design.name!r} {problem}: there is no guaranteed threshold over a region for it. Learn "
-            "thresholds from rows without faults (kind 'learned' with normal=...).",
+            f"Design {design.name!r} has no certificate of decay: there is no guaranteed threshold over a region for "
+            "it. Learn thresholds from rows without faults (kind 'learned' with normal=...).",
             path="kind",
         )
 

@@ -208,7 +208,7 @@ def require_no_region(design: ObserverDesign, kind: str) -> None:
     if isinstance(design.observer, (RegionObserver, ScheduledObserver)):
         raise SpecError(
             f"Design {design.name!r} is over a region, where the monitor {kind!r} has no bound of the residual. Take "
-            "pointwise on data (obsynth.online_monitor) for a scheduled design in discrete time, or learn "
+            "pointwise on data (obsynth.online_monitor) for a scheduled design, or learn "
             "thresholds from rows without faults (kind 'learned' with normal=...).",
             path="kind",
         )
