@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from tests.support.polytopic_plants import wang
@@ -35,6 +38,33 @@ def test_a_slower_parameter_costs_less_and_any_course_stands_last() -> None:
     assert found.claims[0] < found.claims[1]
     axes = found.plot()
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0.02", "any"]
+
+
+@pytest.mark.parametrize(
+    ("dt", "decays", "used"),
+    [
+        (1.0, (0.9, 0.7, 0.8), (1.0, 0.5, 1.0)),
+        (0.0, (0.5, 2.0, 1.0), (1.0, 0.5, 1.0)),
+        (0.0, (3.0, 4.0, 2.0), (0.5, 0.5, 1.0)),
+    ],
+)
+def test_a_smaller_region_is_never_worse(
+    dt: float, decays: tuple[float, ...], used: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is proved over a larger region stands in the place of less that is proved over a smaller one."""
+    gains = {0.1: 3.0, 0.5: 2.5, 1.0: 2.0}
+    slower = dict(zip(gains, decays, strict=True))
+
+    def made(_: object, __: str, value: float, *___: object) -> SimpleNamespace:
+        claims = {"gamma": gains[value], "region_decay": slower[value]}
+        return SimpleNamespace(certificate=SimpleNamespace(claims=claims), observer=SimpleNamespace(dt=dt), plant=None)
+
+    module = import_module("obsynth.studies.region_trade_off")
+    monkeypatch.setattr(module, "_designed", made)
+    monkeypatch.setattr(module, "ObserverDesign", SimpleNamespace)
+    found = obsynth.region_trade_off(wang(), sizes=[0.1, 0.5, 1.0])
+    assert found.designed_for == used
+    assert np.array_equal(found.claims, [gains[size] for size in used])
 
 
 def test_a_region_that_is_too_large_is_a_row_with_its_reason() -> None:

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 #: Shares of the region by default, about its middle.
 SIZES = (0.1, 0.25, 0.5, 0.75, 1.0)
 #: What is looked for in a certificate, in this order.
-CLAIMS = ("gamma", "region_deviation", "region_gain", "region_decay")
+DECAY = "region_decay"
+CLAIMS = ("gamma", "region_deviation", "region_gain", DECAY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,10 @@ class RegionTradeOff:
     claim : str
         Name of the claim.
     designs : tuple of ObserverDesign or str
-        The design of each, or why there is none.
+        The design of each, or why there is none.  What is proved over a region holds over every smaller one, and for
+        every slower parameter: where the design of a larger value proves more than the own one, it stands in its place.
+    designed_for : tuple of float
+        The value that each of these designs was made for.
 
     Examples
     --------
@@ -62,6 +66,7 @@ class RegionTradeOff:
     values: tuple[float, ...]
     claim: str
     designs: tuple[ObserverDesign | str, ...]
+    designed_for: tuple[float, ...]
 
     @property
     def claims(self) -> FloatArray:
@@ -80,9 +85,13 @@ class RegionTradeOff:
         return reached
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each value: what is proved, what is reached, their ratio, and why there is no design."""
+        """Return a row for each value: what is proved, what is reached, their ratio, and why there is no design, or
+        which larger value the design is for."""
         claims, reached = self.claims, self.reached
-        why = [design if isinstance(design, str) else "" for design in self.designs]
+        why = [
+            design if isinstance(design, str) else "" if own == used else f"design for {self.by} {used:g}"
+            for design, own, used in zip(self.designs, self.values, self.designed_for, strict=True)
+        ]
         columns = {self.by: self.values, self.claim: claims, "reached": reached, "ratio": reached / claims, "why": why}
         return pd.DataFrame(columns)
 
@@ -181,7 +190,37 @@ def region_trade_off(
     if claim is not None and made and any(claim not in design.certificate.claims for design in made):
         raise SpecError(f"No design claims {claim!r}; {there_are(claim, known)}", path="claim")
     numbers = tuple(float("inf") if value is None else float(value) for value in values)
-    return RegionTradeOff(by, numbers, claim or (known[0] if known else CLAIMS[0]), tuple(designs))
+    name = claim or (known[0] if known else CLAIMS[0])
+    places = range(len(numbers))
+    used = [_best_of_larger(name, numbers, designs, place) if name in CLAIMS else place for place in places]
+    return RegionTradeOff(
+        by, numbers, name, tuple(designs[place] for place in used), tuple(numbers[place] for place in used)
+    )
+
+
+def _best_of_larger(claim: str, values: Sequence[float], designs: Sequence[ObserverDesign | str], place: int) -> int:
+    """Return the place of the design that proves most for a value: its own, or that of a larger one."""
+    own = designs[place]
+    larger = {
+        other: design
+        for other, design in enumerate(designs)
+        if values[other] > values[place] and isinstance(design, ObserverDesign)
+    }
+    better = [other for other, design in larger.items() if isinstance(own, str) or _proves_more(design, own, claim)]
+    return min(better, key=lambda other: _as_cost(larger[other], claim), default=place)
+
+
+def _proves_more(design: ObserverDesign, other: ObserverDesign, claim: str) -> bool:
+    """Whether a claim is better, and no decay slower."""
+    better = _as_cost(design, claim) < _as_cost(other, claim)
+    return better and not _as_cost(design, DECAY) > _as_cost(other, DECAY)
+
+
+def _as_cost(design: ObserverDesign, claim: str) -> float:
+    """Return a claim, larger where it is worse; decays are rates, but for factors a sample."""
+    value = float(design.certificate.claims.get(claim, np.nan))
+    is_rate = claim == DECAY and (design.observer.dt == 0.0 or isinstance(design.plant, DAEModel))
+    return -value if is_rate else value
 
 
 def _designed(
