@@ -31,6 +31,7 @@ from obsynth.specs.plant_sections import (
     matlab_plant,
     noise_model_of,
     noise_needs_states,
+    none_of_noise,
     read_value,
 )
 from obsynth.specs.scenario_section import built_scenario
@@ -271,7 +272,7 @@ def spec_of(
         scenario=built_scenario(checked.scenario, plant, source),
         model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
-        noise=noise or None,
+        noise={**none_of_noise(section), **noise} or None,
         inputs=_checked_inputs(checked.inputs, plant, source),
     )
 

@@ -149,6 +149,11 @@ def noise_model_of(section: Any) -> dict[str, Any]:
     return {name: dict(value) for name, value in noise.items() if value}
 
 
+def none_of_noise(section: Any) -> dict[str, Any]:
+    """Return what a section states that there is none of, as an empty mapping: coloured noise, offsets, walks."""
+    return {name: {} for name in _NOISE_MODEL if getattr(section, name, None) == {}}
+
+
 def noise_needs_states(noise: Mapping[str, Any]) -> bool:
     """Whether what is said of noise needs states of its own: colour, offsets or walks."""
     coloured = any(isinstance(item, dict) for item in noise.get("sensor_noise", {}).values())

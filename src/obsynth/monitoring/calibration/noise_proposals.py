@@ -43,6 +43,15 @@ LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLAN
 #: are moved to see what they explain, in widths of their bounds.
 LEAST_OFFSET_GAIN, SMALL_MOVE = 2.0, 1e-4
 
+#: Nats for each row above which a state stands for an error of the model: those of noise that is correlated over 100
+#: rows; a constant that is off by a factor of ten was taken for noise of a sensor that lasts as long as the log.
+NATS_OF_MODEL_ERRORS = 2.0
+
+_MODEL_ERROR = (
+    "That is more than the noise or an offset of {name} is likely to explain: a constant that is not among the unknown "
+    "ones, an equation or a unit may be wrong instead."
+)
+
 _STATE_SENTENCES = {
     "coloured": "The noise of {name} is coloured: the model has a state for it (better by {gain:.3g} nats).",
     "offset": "The sensor {name} has an offset: the model has a state for it (better by {gain:.3g} nats).",
@@ -93,6 +102,8 @@ def proposed_states(
         hidden = hidden_faults(problem, fit, tried) if kind == "offset" else ()
         least = LEAST_EXPLANATION if hidden else LEAST_NATS[kind]
         sentences.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
+        if kind != "walk" and gain > NATS_OF_MODEL_ERRORS * problem.log.samples:
+            sentences.append(_MODEL_ERROR.format(name=name))
         if hidden:
             sentences.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
         states, value, start = tried, reached, place

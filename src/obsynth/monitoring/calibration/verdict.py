@@ -17,6 +17,7 @@ from obsynth.monitoring.calibration.diagnostics import (
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.integration_error import IntegrationError
 from obsynth.monitoring.calibration.logs import EVEN, listed_rows
+from obsynth.monitoring.calibration.noise_states import correlation_name
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import Fit, unexplained
 from obsynth.monitoring.calibration.variance_names import variance_names
@@ -58,7 +59,12 @@ def on_constants(
         f"The box of {name} is open on its {side} side: the bound limits it there, the log does not."
         for name, side in box.open_sides
     ]
-    sentences += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
+    sentences += [
+        f"{name} is at a bound: noise that lasts as long as the log is a drift, or an error of the model."
+        if name.startswith(correlation_name(""))
+        else f"{name} is at a bound: widen it if the constant may lie beyond."
+        for name in at_end
+    ]
     free = [
         i
         for i, name in enumerate(problem.names)

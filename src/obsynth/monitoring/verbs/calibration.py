@@ -154,7 +154,7 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
         if "sensor_noise" in arguments:
             # White noise is calibrated anew.
             coloured = {name: item for name, item in arguments["sensor_noise"].items() if isinstance(item, dict)}
-            arguments["sensor_noise"] = coloured or None
+            arguments["sensor_noise"] = coloured if coloured or not arguments["sensor_noise"] else None
         arguments |= dict(spec.calibrate or {})
         if arguments["log"] is not None:
             arguments["log"] = spec.path.parent / arguments["log"]
