@@ -20,9 +20,8 @@ from obsynth.conditions.polytope import vertex_inequalities
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
-from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.plant_units import PlantUnits, noise_inputs
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.registered import registered
 from obsynth.verification.error_polytope import ErrorPolytope
@@ -81,7 +80,7 @@ def pi_over_region(plant: PolytopicSystem, model: Exosystem, *, noise: Mapping[s
         for vertex in plant.vertices
     ]
     u, d = with_faults(decoupled.U, decoupled.Dhat, works[0], scaled_model)
-    bw, dw = _noise(works[0], units, weights)
+    bw, dw = noise_inputs(works[0], units, weights.get("measurement"))
     size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
     order, ny = scaled_model.order, widened.ny
     strength = np.concatenate(
@@ -107,19 +106,6 @@ def pi_over_region(plant: PolytopicSystem, model: Exosystem, *, noise: Mapping[s
     B = [np.hstack([b, np.zeros((len(b), D.shape[1] - b.shape[1]))]) for b in B]
     errors = ErrorPolytope(A, own_c, B=B, D=D, dt=1.0 if units.discrete else 0.0)
     return PiOverRegion(model, units, decoupled, u, d, tuple(injected), errors)
-
-
-def _noise(plant: DescriptorSystem, units: PlantUnits, weights: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return the noise inputs of a scaled plant: what is asked for, what the plant states, or one on each output."""
-    measurement = weights.get("measurement")
-    if measurement is None and plant.Dw.any():
-        return plant.Bw, plant.Dw
-    deviations = np.ones(plant.ny)
-    if measurement is not None:
-        listed = [measurement[name] if isinstance(measurement, Mapping) else measurement for name in plant.output_names]
-        deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
-    stated = np.zeros((plant.ny, plant.nw))
-    return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])
 
 
 def share_pasand_over_region(plant: PolytopicSystem, *, fault_model: Any, margin: float) -> Conditions:

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.restricted_equivalent import prepare
+from obsynth.analysis.existence.turning_filter import correction_equations
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
 from obsynth.conditions.polytope import MOST_ROOM, TRACE
@@ -240,16 +241,8 @@ def _constant_parts(plant: PolytopicSystem) -> tuple[FloatArray, FloatArray]:
 def _exactly_decoupled(K: list[FloatArray], C: FloatArray, TB: list[FloatArray]) -> list[FloatArray]:
     """Return the nearest gains that satisfy the equations to rounding: a solver satisfies them to its tolerances."""
     m = K[0].shape[1]
-    rows, right = [], []
-    for i in range(VERTICES):
-        for j in range(i, VERTICES):
-            # Acts on the rows of [K1 K2]: (K_i CTB_j + K_j CTB_i) = TB_i + TB_j.
-            row = np.zeros((2 * m, TB[0].shape[1]))
-            row[i * m : (i + 1) * m] += C @ TB[j]
-            row[j * m : (j + 1) * m] += C @ TB[i]
-            rows.append(row)
-            right.append(TB[i] + TB[j])
-    W, target, whole = np.hstack(rows), np.hstack(right), np.hstack(K)
+    W, target = correction_equations(C, TB)
+    whole = np.hstack(K)
     whole = whole - (whole @ W - target) @ np.linalg.pinv(W)
     whole = whole - (whole @ W - target) @ np.linalg.pinv(W)
     return [whole[:, :m], whole[:, m:]]

@@ -7,8 +7,10 @@ Of plants that are sampled so fast that A is nearly E they are those of ``A - E`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -285,3 +287,16 @@ def _model_units(model: Exosystem | None, factors: FloatArray, faults: FloatArra
         size = float(np.linalg.norm(row * factors))
         units[linked] = factors[linked] * (fault / size if size > 0.0 else 1.0)
     return units
+
+
+def noise_inputs(plant: DescriptorSystem, units: PlantUnits, measurement: Any) -> tuple[FloatArray, FloatArray]:
+    """Return Bw and Dw of a scaled plant: with noise of its outputs as ``measurement`` says (one number, or numbers by
+    name, in the units of the plant as given), or else as the plant states, or else of one on each output."""
+    if measurement is None and plant.Dw.any():
+        return plant.Bw, plant.Dw
+    deviations = np.ones(plant.ny)
+    if measurement is not None:
+        listed = [measurement[name] if isinstance(measurement, Mapping) else measurement for name in plant.output_names]
+        deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
+    stated = np.zeros((plant.ny, plant.nw))
+    return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])

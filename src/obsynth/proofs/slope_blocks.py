@@ -105,10 +105,15 @@ class SlopeBlock:
     def _trace(self, P: FloatArray, power: float) -> _Formed:
         def formula(kind: type[Enclosed]) -> Enclosed:
             _, b, _, dz = self.nominal(kind)
-            lyapunov, total = kind.exact(P), kind.exact(np.ones((1, 1))).scaled(power).scaled(power)
-            for unit in np.eye(b.shape[1])[:, :, None]:
-                column, direct = b @ kind.exact(unit), dz @ kind.exact(unit)
-                total = total - column.T @ (lyapunov @ column) - direct.T @ direct
-            return total
+            return mean_square_form(kind, kind.exact(P), b, dz, power)
 
         return formula
+
+
+def mean_square_form(kind: type[Enclosed], lyapunov: Enclosed, b: Enclosed, dz: Enclosed, level: float) -> Enclosed:
+    """Return ``level^2 - |Dz|^2 - tr B'PB``, positive where the mean of ``|z|^2`` is below ``level^2``."""
+    total = kind.exact(np.ones((1, 1))).scaled(level).scaled(level)
+    for unit in np.eye(b.shape[1])[:, :, None]:
+        column, direct = b @ kind.exact(unit), dz @ kind.exact(unit)
+        total = total - column.T @ (lyapunov @ column) - direct.T @ direct
+    return total

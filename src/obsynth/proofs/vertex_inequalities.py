@@ -38,7 +38,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block
-from obsynth.proofs.slope_blocks import SlopeBlock
+from obsynth.proofs.slope_blocks import SlopeBlock, mean_square_form
 
 #: Weights at the vertices now and at the next sample.
 Pair = tuple[FloatArray, FloatArray]
@@ -398,11 +398,7 @@ class _Forms:
             used = np.flatnonzero(now)
             parts = [self.vertices[int(i)](kind) for i in used]
             b, dz = _mean([part[1] for part in parts], now[used]), _mean([part[3] for part in parts], now[used])
-            after, total = self._lyapunov(kind, then), kind.exact(np.ones((1, 1))).scaled(level).scaled(level)
-            for unit in np.eye(b.shape[1])[:, :, None]:
-                column, direct = b @ kind.exact(unit), dz @ kind.exact(unit)
-                total = total - column.T @ (after @ column) - direct.T @ direct
-            return total
+            return mean_square_form(kind, self._lyapunov(kind, then), b, dz, level)
 
         return formula
 

@@ -28,7 +28,7 @@ from obsynth.plants.transformations.elimination import eliminate_algebraic_state
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.signals import ScenarioSignals, resolve, signal_of
+from obsynth.simulation.signals import ScenarioSignals, resolve, signal_of, signals_of
 from obsynth.simulation.trajectory import Trajectory
 
 #: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
@@ -52,9 +52,7 @@ def simulate_plant(
             path="dt",
         )
     steps = whole_number(steps, "steps", "a whole number of samples")
-    sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
-    arrays = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: signal_of(arrays[name], name, (steps, size)) for name, size in sizes.items()}
+    signals = signals_of(plant, steps, u=u, f=f, d=d, w=w)
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     if plant.delays:
         return _with_delays(plant, steps, signals, start)

@@ -22,7 +22,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.simulation.linear import PlantRuns
 from obsynth.simulation.profiles import Additive
 from obsynth.simulation.scenario import Scenario, profiles_of
-from obsynth.simulation.signals import ScenarioSignals, signal_of
+from obsynth.simulation.signals import ScenarioSignals, signals_of
 from obsynth.simulation.trajectory import Trajectory
 
 #: Parts of an interval in which parameters move: the error of each falls with the cube of its length.
@@ -88,9 +88,7 @@ def simulate_polytopic(
     dt = _sample_time(plant, sample_time)
     require_inside(plant, parameters, dt)
     steps = len(parameters)
-    sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
-    arrays = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: signal_of(arrays[name], name, (steps, size)) for name, size in sizes.items()}
+    signals = signals_of(plant, steps, u=u, f=f, d=d, w=w)
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     drive = np.hstack([signals["u"], signals["f"], signals["d"]])[:, None]
     states, outputs = region_runs(plant, (parameters, parameters), drive, drive, signals["w"][:, None], start, dt)

@@ -218,6 +218,14 @@ def _actuator(plant: DescriptorSystem | PolytopicSystem, fault: str, scenario: S
     return inputs[0]
 
 
+def signals_of(
+    plant: DescriptorSystem | PolytopicSystem, steps: int, **values: ArrayLike | None
+) -> dict[str, FloatArray]:
+    """Return inputs u, faults f, disturbances d and noise w of a plant over a record, each ``(steps, signals)``."""
+    sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
+    return {name: signal_of(values[name], name, (steps, size)) for name, size in sizes.items()}
+
+
 def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> FloatArray:
     """Return a signal over a record, zero where none is given; a list of numbers is a single one."""
     if value is None or (0 in shape and not np.size(value)):

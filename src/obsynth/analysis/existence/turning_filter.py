@@ -79,7 +79,7 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     yield after_one_sample
     if not after_one_sample.holds:
         return
-    rows, target = _equations(C, driven)
+    rows, target = correction_equations(C, driven)
     freedom = decide_rank(rows)
     solvable = decide_rank(np.vstack([rows, target])).rank == freedom.rank
     yield _correction_condition(plant, solvable)
@@ -147,7 +147,7 @@ def _corrections(rows: FloatArray, target: FloatArray, rank: int) -> tuple[Float
     return np.asarray(K0), np.asarray(left_vectors[:, rank:])
 
 
-def _equations(C: FloatArray, driven: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def correction_equations(C: FloatArray, driven: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return G ``(N ny, pairs nf)`` and H ``(nx, pairs nf)`` of ``[K_1, K_2] G = H``."""
     m, nf = C.shape[0], driven[0].shape[1]
     columns, right = [], []

@@ -24,7 +24,7 @@ from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem
 from obsynth.plants.pencil import shown_modes, structure_of
-from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.plant_units import PlantUnits, noise_inputs
 
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 INTEGRATOR_SCATTER = 3e-5
@@ -167,7 +167,7 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
     """
     plant, split = problem.plant, problem.split
     order = problem.model.order
-    bw, dw = _noise(problem, weights)
+    bw, dw = noise_inputs(problem.plant, problem.units, weights.get("measurement"))
     augmented_bw = np.vstack([bw, np.zeros((order, bw.shape[1]))])
     injection = np.vstack([problem.decoupled.injection, np.zeros((order, plant.ny))])
     driving = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
@@ -198,16 +198,3 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
         estimates=split.observable_columns(faults),
         dt=plant.dt,
     )
-
-
-def _noise(problem: PlacementProblem, weights: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return the noise inputs of the scaled plant."""
-    plant, units = problem.plant, problem.units
-    measurement = weights.get("measurement")
-    if measurement is None and plant.Dw.any():
-        return plant.Bw, plant.Dw
-    deviations, stated = np.ones(plant.ny), np.zeros((plant.ny, plant.nw))
-    if measurement is not None:
-        listed = [measurement[name] if isinstance(measurement, Mapping) else measurement for name in plant.output_names]
-        deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
-    return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])

@@ -4,22 +4,15 @@ r"""Scheduled observers: linear ones whose matrices are means, with weights from
     z^+ = A_z(\mu_k) z + B_u(\mu_k) u + B_y(\mu_k) y, \qquad
     [\hat x; \varphi; r] = C_z z + D_u u + D_y y, \qquad \hat f = \Delta(\mu_{k-1})^{-1} \varphi
 
-with the weights of the sample itself, but for the effectiveness :math:`\Delta` of the faults: an estimate that lags by
-a sample belongs to the parameters of the sample before.  So does a correction :math:`K(\mu_{k-1}) r` that is added to z
-before the state estimates and the step are formed, where there is one: z was formed with those weights.
-
-Scheduling parameters are read after the known inputs.  A missing one keeps its last value, one outside
-its range is moved to the nearest end; from then on, until the error has decayed again, a row is marked: nothing is
-claimed there.
-
-In continuous time (``dt = 0``) the matrices are those of z', and a row that comes h seconds after the one before is
-taken by a step of implicit Euler, with the weights at its end:
+with the weights of the sample itself, but for the effectiveness :math:`\Delta` of the faults and a correction
+:math:`K(\mu_{k-1}) r` of z: both belong to the parameters of the sample before.  In continuous time (``dt = 0``) a row
+is taken by a step of implicit Euler over the h seconds since the one before,
 
 .. math::
-    z_k = (I - h A_z(\mu_k))^{-1} (z_{k-1} + h B_u(\mu_k) u_k + h B_y(\mu_k) y_k)
+    z_k = (I - h A_z(\mu_k))^{-1} (z_{k-1} + h B_u(\mu_k) u_k + h B_y(\mu_k) y_k),
 
-Errors that obey :math:`e' = A_z(\mu) e` and decay like :math:`e^{-a t}` in the norm of a matrix P for every course then
-shrink in the same norm by :math:`(1 + 2 a h)^{-1/2}`, however long the step is.
+and errors that decay like :math:`e^{-a t}` in the norm of a matrix P for every course of the parameters shrink in it by
+:math:`(1 + 2 a h)^{-1/2}`, however long the step is.
 """
 
 from __future__ import annotations
@@ -61,7 +54,10 @@ class ScheduledState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
-    """An observer whose matrices change with measured parameters.
+    """An observer whose matrices change with measured parameters, which are read after the known inputs.
+
+    A missing parameter keeps its last value, and one outside its range is moved to the nearest end: from then on, until
+    the error has decayed again, nothing is claimed.
 
     Parameters
     ----------
@@ -301,8 +297,7 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         if self.dt == 0.0:
             return self._moved(state, y, u, seconds)
         inputs, measured = u[: self.inputs], u[self.inputs :]
-        before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
-        parameters = np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
+        parameters = self._parameters(state, measured)
         weights = self.scheduling.weights(parameters)
         row, z = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y, state.z
         if self.correction is not None:
@@ -322,13 +317,17 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         return ScheduledState(after, weights, parameters, unclaimed), row
 
+    def _parameters(self, state: ScheduledState, measured: FloatArray) -> FloatArray:
+        """Return the parameters of a sample: a missing one as it last was, one outside its range at the nearest end."""
+        before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
+        return np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
+
     def _moved(
         self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float
     ) -> tuple[ScheduledState, FloatArray]:
         """Return the state after a step of implicit Euler in continuous time, and the row at its end."""
         inputs, measured = u[: self.inputs], u[self.inputs :]
-        before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
-        parameters = np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
+        parameters = self._parameters(state, measured)
         weights = self.scheduling.weights(parameters)
         Az, Bu, By = (np.tensordot(weights, matrix, 1) for matrix in (self.Az, self.Bu, self.By))
         driven = state.z + seconds * (Bu @ inputs + By @ y)
