@@ -558,7 +558,7 @@ class TestSpecFileItself:
         [
             (lambda path: None, "spec.yaml does not exist"),
             (lambda path: path.mkdir(), "spec.yaml is a folder"),
-            (lambda path: path.write_bytes(b"name: \xff\n"), "is no UTF-8 text"),
+            (lambda path: path.write_bytes(b"# one\nname: \xff\n"), "is no UTF-8 text (line 2): save it as UTF-8"),
         ],
         ids=["missing", "a folder", "not UTF-8"],
     )

@@ -263,7 +263,7 @@ def test_a_sample_that_is_not_finite_leaves_the_c_observer_alone(sampled, tmp_pa
     ("which", "name", "sample_time", "message"),
     [
         ("sampled", "a.xlsx", None, "unknown suffix"),
-        ("sampled", "a", None, "unknown suffix"),
+        ("sampled", "a", None, "a has no suffix: use one of .mat"),
         ("sampled", "nowhere/a.mat", None, "cannot be written"),
         ("sampled", "a.mat", 0.1, "sampled already"),
         ("continuous", "a.c", None, "continuous in time: give the sample time"),

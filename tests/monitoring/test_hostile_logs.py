@@ -256,7 +256,7 @@ def test_files_of_other_kinds_are_refused_in_the_same_sentences(
         table.to_excel(log, index=False)
     elif kind == "a folder":
         log.mkdir()
-        wanted = "is a folder: name one file"
+        wanted = "is a folder: give the name of a file"
     else:
         log, wanted = written(clean(), tmp_path / "log.txt"), "has an unknown suffix: use one of .csv"
     assert main(command(folder, "run", log, tmp_path)) == 2

@@ -22,6 +22,7 @@ from obsynth.exporting.independent import copy_checker
 from obsynth.exporting.proof_file import write_proof
 from obsynth.exporting.realisation import Realisation
 from obsynth.exporting.scheduled_arrays import scheduled_arrays
+from obsynth.files.inputs import suffix_error
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -223,7 +224,7 @@ def _checked_target(path: str | Path) -> Path:
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in EXPORT_SUFFIXES:
-        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
+        raise suffix_error(target, EXPORT_SUFFIXES)
     if suffix == ".c" and _C_HEADERS.fullmatch(target.stem):
         raise SpecError(
             f"{target} comes with a header {target.stem}.h, which a compiler may read in place of C's own: name it "

@@ -10,7 +10,7 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -150,6 +150,23 @@ def input_file(path: Path, *, where: str | None = None, is_protected: bool = Tru
     return path
 
 
+def suffix_error(path: Path, suffixes: Iterable[str]) -> SpecError:
+    """Return the error for a file whose name ends in none of some suffixes."""
+    has = "an unknown suffix" if path.suffix else "no suffix"
+    return SpecError(f"{path} has {has}: use one of {', '.join(suffixes)}.", path=str(path))
+
+
+def _lines_before(path: Path, most: int) -> int:
+    """Return how many lines of a file, of at most so many bytes, end before its first byte that is no UTF-8."""
+    with path.open("rb") as stream:
+        data = stream.read(most)
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        return data[: error.start].count(b"\n")
+    return data.count(b"\n")
+
+
 def read_text(
     path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MOST_DOCUMENT_CHARACTERS
 ) -> str:
@@ -160,7 +177,8 @@ def read_text(
         with path.open(encoding="utf-8-sig") as stream:
             text = stream.read(most + 1)
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=place) from error
+        line = _lines_before(path, 4 * most) + 1
+        raise SpecError(f"{path} is no UTF-8 text (line {line}): save it as UTF-8.", path=place) from error
     except (OSError, MemoryError) as error:
         raise SpecError(f"{path} cannot be read: {reason(error)}.", path=place) from error
     if len(text) > most:

@@ -116,9 +116,14 @@ def _model_condition(
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
         alone = len(faults) == 1
         who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
+        hidden = (
+            "their effects on the outputs cancel, so no observer that is decoupled from the unknown inputs can"
+            if masked
+            else "it has no effect on the outputs, so no observer can"
+        )
         detail += (
-            f": at {where} {who}{masked or ' is output-nulling'}: it has no effect on the outputs, so no observer can "
-            f"estimate {'it' if alone else 'them'}. Measure another signal, or leave one of them out."
+            f": at {where} {who}{masked or ' is output-nulling'}: {hidden} estimate {'it' if alone else 'them'}. "
+            "Measure another signal, or leave one of them out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",

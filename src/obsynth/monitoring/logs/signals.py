@@ -17,7 +17,7 @@ from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.measurement_units import MICRO_SIGNS, conversion
-from obsynth.numerics.suggestions import suggestion
+from obsynth.numerics.suggestions import suggestion, there_are
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
@@ -69,7 +69,8 @@ class LogSignals:
         unknown += [name for name in factors if name not in names]
         if unknown:
             raise SpecError(
-                f"{unknown[0]!r} is no input or output of this observer, which has {', '.join(names)}.", path="columns"
+                f"{unknown[0]!r} is no input or output of this observer; {there_are(unknown[0], names)}",
+                path="columns",
             )
         for name, column in renamed.items():
             require_kind(column, str, f"The column of {name!r}", "the name of a column", path="columns")

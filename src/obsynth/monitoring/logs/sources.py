@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TextIO, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file, reason
+from obsynth.files.inputs import input_file, reason, suffix_error
 from obsynth.monitoring.logs.binary_logs import NEEDED_PACKAGES, READERS, read_by_package
 from obsynth.monitoring.logs.signals import (
     TIME_HEADER,
@@ -196,9 +196,9 @@ def check_suffix(path: Path, suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> None
     """Raise `SpecError` unless a file is of a known kind by its name, and its package is installed."""
     suffix = log_suffix(path)
     if suffix not in suffixes and path.is_dir():
-        raise SpecError(f"{path} is a folder: name one file.", path=str(path))
+        raise SpecError(f"{path} is a folder: give the name of a file.", path=str(path))
     if suffix not in suffixes:
-        raise SpecError(f"{path} has an unknown suffix: use one of {', '.join(suffixes)}.", path=str(path))
+        raise suffix_error(path, suffixes)
     if suffix in NEEDED_PACKAGES:
         package, extra = NEEDED_PACKAGES[suffix]
         try:

@@ -96,10 +96,7 @@ class UnitCheck:
             option = f"--scale {shlex.quote(name)}={change.factor:.15g}"
             remedy = f"give the factor ({option}, scales={{{name!r}: {change.factor:.15g}}})"
         made = f"adding {change.shift:g}" if change.shift else f"multiplying by {change.factor:.6g}"
-        return (
-            f"From its first row on {name} is not what the design expects, and is after {made} ({change.words}): "
-            f"{remedy}"
-        )
+        return f"The first rows of {name} do not fit the design, but would after {made} ({change.words}): {remedy}"
 
     def explanation(self, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
         """Return the signal and the change of its unit that explain the first of ``rows (n, nu + ny)``, which are not

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from obsynth.errors import SpecError
+from obsynth.files.inputs import suffix_error
 from obsynth.files.outputs import FileKind, write_atomically
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
@@ -17,7 +17,7 @@ def picture_kind(target: Path) -> FileKind:
     """Return what kind of picture a file is to be, by its suffix."""
     suffix = target.suffix.lower()
     if suffix not in PICTURES:
-        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(PICTURES)}.", path=str(target))
+        raise suffix_error(target, PICTURES)
     return FileKind(f"a picture ({suffix})", PICTURES[suffix])
 
 
