@@ -141,12 +141,12 @@ def test_what_cannot_is_refused_by_name():
     times = np.round(np.cumsum([0.0, *rng.uniform(0.01, 0.3, 30)]), 4)
     u, y = rng.normal(size=(31, 1)), rng.normal(size=(31, 1))
     written = obsynth.DescriptorSystem(A=expm(A * DT), B=B, C=C, dt=DT, sensor_noise={"y1": DEVIATION}, Bw=NOISE)
-    for made in (
-        obsynth.descriptor_kalman(written),
-        design(sampled=plant(delays={"u1": 0.1})),
-        design(sensors={"y1": {"every": 2}}),
+    for made, why in (
+        (obsynth.descriptor_kalman(written), "stated in samples"),
+        (design(sampled=plant(delays={"u1": 0.1})), "the plant has delays"),
+        (design(sensors={"y1": {"every": 2}}), "sensors that are sampled every so many rows"),
     ):
-        with pytest.raises(obsynth.SpecError, match="continuous"):
+        with pytest.raises(obsynth.SpecError, match=f"continuous plant that was sampled .*{why}"):
             run(made, times, u, y)
     with pytest.raises(obsynth.SpecError, match="not smoothed over irregular time stamps"):
         run(design(), times, u, y, smooth=True)

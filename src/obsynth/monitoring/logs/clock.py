@@ -81,10 +81,11 @@ class StampError(SpecError):
 
 
 class Clock:
-    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
+    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds;
+    ``why``: why a recursive design takes no other interval than dt."""
 
-    def __init__(self, dt: float, gap: float | None, *, irregular: bool = False) -> None:
-        self.dt, self.gap, self.irregular = dt, gap, irregular
+    def __init__(self, dt: float, gap: float | None, *, irregular: bool = False, why: str = "") -> None:
+        self.dt, self.gap, self.irregular, self.why = dt, gap, irregular, why
         # Sampled designs that take any interval: whether the last one was taken as it is, and by how many seconds
         # such intervals have been longer than dt.
         self.is_own, self.longer, self.is_uneven = False, 0.0, False
@@ -210,7 +211,8 @@ class Clock:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
                 "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
-                "need a continuous-time design, or a recursive one of a continuous plant that was sampled."
+                "need a continuous-time design, or a recursive one of a continuous plant that was sampled"
+                f"{f' (this recursive design takes no other interval: {self.why})' if self.why else ''}."
                 f"{unit_advice(step / self.dt)}",
                 path=f"row {row}",
             )

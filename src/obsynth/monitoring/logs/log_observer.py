@@ -64,6 +64,7 @@ class LogObserver(ABC):
     notes: tuple[str, ...] = ()  # what a user should know before anything is run
     plant: DescriptorSystem | None = None  # of a linear design
     takes_any_interval: bool = False  # of a sampled design: each step from the continuous plant, over its own interval
+    own_intervals_only: str = ""  # of a recursive design that does not: why
     input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
     saved: ClassVar[Mapping[str, str]] = {}  # attributes that go from row to row, by their names in a saved state
 

@@ -79,7 +79,7 @@ class LogRun:
             self.unrepeated = None if learned.repeats is None else Unrepeated(learned.repeats)
             self.beyond = None if learned.ranges is None else RowsBeyond(learned.ranges)
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
-        self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval)
+        self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval, why=observer.own_intervals_only)
         self.signals = LogSignals.of(observer, columns, scales, getattr(design.plant, "units", {}))
         self.stamps, self.monitor = stamps, monitor
         #: What rows wait in for those after them, if they do.

@@ -41,8 +41,10 @@ class SteppingLogObserver(LogObserver):
             self.point, self.scales = model.operating_point, model.scales
             constant = model.is_time_invariant and Q.is_constant and R.is_constant
             self.may_restart = constant and model.horizon is None
-            self.intervals = _irregular_steps(self.observer, design)
+            intervals = _irregular_steps(self.observer, design)
+            self.intervals = None if isinstance(intervals, str) else intervals
             self.takes_any_interval = self.intervals is not None
+            self.own_intervals_only = intervals if isinstance(intervals, str) else ""
         self.columns = (
             *self.estimated,
             *(f"sd {name}" for name in self.estimated),
@@ -220,12 +222,13 @@ class SteppingLogObserver(LogObserver):
         return evidence
 
 
-def _irregular_steps(observer: RecursiveObserver, design: ObserverDesign) -> IrregularSteps | None:
-    """Return the steps over any interval of an observer whose plant was sampled; `None` where there are none."""
+def _irregular_steps(observer: RecursiveObserver, design: ObserverDesign) -> IrregularSteps | str:
+    """Return the steps over any interval of an observer whose plant was sampled; why there are none, where there are
+    none."""
     source = design.source
     if source is None or source.sample_time is None:
-        return None
+        return "its plant was stated in samples, and what happens between them is not known"
     try:
         return IrregularSteps(observer, source.plant)
-    except (SpecError, PreconditionError):
-        return None
+    except (SpecError, PreconditionError) as error:
+        return str(error)
