@@ -156,3 +156,11 @@ def test_modes_that_grow_and_that_no_input_drives_are_followed_where_outputs_are
     assert design.report.passed
     assert "A mode of the plant does not decay" in design.notes[-1]
     assert 0.05 * (1.0 - 1e-8) < design.least <= design.gain < design.least * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("seed", "count"), [(0, 3), (2, 3), (1, 5)])
+def test_of_outputs_that_show_second_derivatives_of_white_noise_the_reason_is_named(seed: int, count: int) -> None:
+    """Multiple infinite modes were taken for fast ones: a zero was named, or the filter failed its verification."""
+    lag = {"A": [[-1.5]], "B": [[1.5]], "C": [[1.0]], "D": [[0.0]]}
+    with pytest.raises(obsynth.PreconditionError, match=r"derivatives of noise or of faults.*Give norm hinf"):
+        obsynth.optimal_filter(turned(seed, count), norm="h2", exact=False, reference=lag)

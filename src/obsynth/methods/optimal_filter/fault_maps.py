@@ -170,7 +170,7 @@ def _finite_mean_square(plant: DescriptorSystem, options: Options) -> Condition:
     claim, holds, detail, of_ours = "some filter has a finite mean square, by a Riccati equation", True, "", False
     try:
         try:
-            least_mean_square(first_problem(plant, options)[1])
+            least_mean_square(first_problem(plant, options)[1], index=structure_of(plant).index or 0)
         except PreconditionError:
             if with_lasting_modes_driven(plant) is plant:
                 raise
@@ -337,7 +337,7 @@ def designed(
         size = min(size, _reference_gain(plant, fault_map, problem.alpha) / ratio)
     try:
         if norm == "h2" and not plant.is_discrete:
-            continuous = least_mean_square(problem, noises=noises)
+            continuous = least_mean_square(problem, noises=noises, index=structure_of(plant).index or 0)
             filter_, gain = continuous.filter, continuous.deviation
             nothing = filter_[0]
             least = LeastEstimation(nothing, nothing, gain, 0.0, 0.0, continuous.added_noise, ())
