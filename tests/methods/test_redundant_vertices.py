@@ -90,7 +90,7 @@ def test_a_gain_of_zero_and_a_first_decay_are_named(monkeypatch: pytest.MonkeyPa
     plant = {"A": [["0.7 + 0.1 * v", 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]]}
     region: dict[str, Any] = {"scheduling": {"v": [-1, 1]}}
     notes = " ".join(obsynth.fault_estimation_filter(PolytopicSystem(plant={**plant, "dt": 1.0}, **region)).notes)
-    assert "least gain is zero but for rounding" in notes
+    assert "the gain is zero but for rounding" in notes
     assert "a faster one" not in notes
     monkeypatch.setattr("obsynth.methods.engines.vertex_certificates.MOST_FAST", 1)
     coupled = {**plant, "C": [[1, 0]], "Bf": [[1], [0.2]], "Bd": [[0.1], [0.3]], "dt": 1.0}

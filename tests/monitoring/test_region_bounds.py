@@ -215,13 +215,20 @@ def test_the_statement_says_for_which_courses_and_a_log_has_the_alarm(design: Ob
 
 
 def test_a_start_and_one_vertex_are_as_for_a_constant_plant() -> None:
-    constant = {"A": [[0.7, 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0.2], [1]], "dt": 1.0}
+    constant: dict[str, Any] = {
+        "A": [[0.7, 0.1], [0, 0.5]],
+        "C": [[1, 0], [0, 1]],
+        "Bf": [[1], [0]],
+        "Bd": [[0.2, 1], [1, 0.3]],
+    }
+    constant["dt"] = 1.0
     one = obsynth.fault_estimation_filter(PolytopicSystem([obsynth.DescriptorSystem(**constant)]))
-    monitor: Any = obsynth.online_monitor(one, disturbance_bounds={"d1": D1}, initial_error=0.0)
+    bounds = {"d1": D1, "d2": D1}  # of which no observer decouples both
+    monitor: Any = obsynth.online_monitor(one, disturbance_bounds=bounds, initial_error=0.0)
     vertex = one.scheduled[0].vertices[0]
     plain = obsynth.fault_estimation_filter(vertex, gamma_margin=0.01)
     same = plain.replace(observer=one.scheduled[1].at_vertex(0), certificate=one.certificate)
-    other: Any = obsynth.online_monitor(same, disturbance_bounds={"d1": D1}, initial_error=0.0, unverified=True)
+    other: Any = obsynth.online_monitor(same, disturbance_bounds=bounds, initial_error=0.0, unverified=True)
     assert monitor.rule.limit == pytest.approx(other.rule.limit, rel=1e-3)
 
 

@@ -14,6 +14,7 @@ from obsynth.proofs.vertex_inequalities import Vertex, Witness
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
+from obsynth.verification.identities import Identity, equality, worst
 from obsynth.verification.over_region import gain_row, share_signals, switching_row
 
 #: Names, claims and sources of the rows on what makes a filter unbiased.
@@ -75,7 +76,10 @@ def gain_rows(
     yield gain_row(vertices, witness, level, gamma, discrete=True, words=words)
     if switched:
         yield switching_row(switched, level)
-    if "gamma_min" in claims:
+    decoupled = decoupled_row(design) if claims.get("gamma_min") == 0.0 else None
+    if decoupled is not None and decoupled.passed:
+        yield decoupled
+    elif "gamma_min" in claims:
         yield information(
             "least gain",
             "the least gain that the inequalities at the vertices allow, as the solver found it",
@@ -83,3 +87,33 @@ def gain_rows(
             source="certificate",
             status="assumed",
         )
+
+
+def decoupled_row(design: ObserverDesign) -> Check:
+    """Return the row that no disturbance reaches a fault estimate, whatever the parameters do: the least gain is 0.
+
+    What a disturbance adds to the errors at any vertex is shown by no fault estimate, and is mapped to zero by the
+    matrix of the errors at every vertex.
+    """
+    (plant, observer), tracking = design.scheduled, design.certificate.matrices["tracking"]
+    residuals, T = [], np.abs(tracking)
+    sizes = [
+        float(np.max(T @ np.abs(vertex.A)) + np.max(np.abs(By) @ np.abs(vertex.C)))
+        for vertex, By in zip(plant.vertices, observer.By, strict=True)
+    ]
+    for place, vertex in enumerate(plant.vertices):
+        added = tracking @ vertex.Bd, -observer.By[place] @ vertex.Dd
+        by_factors = (tracking, vertex.Bd), (observer.By[place], vertex.Dd)
+        rows = observer.fault_rows
+        for left, size in ((observer.Cz[rows], 0.0), *zip(observer.Az, sizes, strict=True)):
+            # What Az is made of may cancel: then it is rounding itself.
+            factors = tuple((np.abs(left) + size, *pair) for pair in by_factors)
+            residuals.append(Identity((left @ added[0], left @ added[1]), factors).residual())
+        residuals.append(Identity((observer.Dy[rows] @ vertex.Dd,)).residual())
+    return equality(
+        "least gain",
+        "the least gain is 0: for every course of the parameters no disturbance reaches a fault estimate, and its "
+        "effect on the errors has gone after one sample",
+        worst(residuals),
+        "Cz (T Bd_j - By_j Dd) = 0, Az_i (T Bd_j - By_j Dd) = 0, Dy Dd = 0 at all vertices i, j",
+    )

@@ -7,6 +7,7 @@ Wang 2015, (45), with the vertices of A1 and T D: P and Y of `obsynth.conditions
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified_for_steps
+from obsynth.methods.fault_estimation_filter.decoupled_gains import decoupling_of
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.fault_estimation_filter.turning_faults import synthesise_turning
@@ -55,8 +57,29 @@ def synthesise_over_region(
     steps = plant.scheduling.usable_step_of(plant.dt)
     progress("solving the inequalities at the vertices")
     certificate = _certified(errors, method, parts, steps)
+    decoupled = _decoupled(errors, method, parts) if certificate.is_negligible else None
     progress("building the realisation and its certificate")
+    # Where that is exact at the price of a slower decay, a gain that is all but zero is better.
+    if decoupled is not None and decoupled.decay <= certificate.decay:
+        return _synthesis(plant, method, parts, W, decoupled, None, decoupled=True)
     return _synthesis(plant, method, parts, W, certificate, steps)
+
+
+def _decoupled(
+    errors: ErrorPolytope, method: FaultEstimationFilter, parts: FilterOverRegion
+) -> VertexCertificate | None:
+    """Return gains with which no disturbance reaches a fault estimate, where they are found."""
+    made = decoupling_of(errors, free_output=method.asks_for_free_weight is not False)
+    if made is None:
+        return None
+    try:
+        rest = _certified(made.errors, method, parts, None)
+        Z = rest.gains * (errors.count if len(rest.gains) == 1 else 1)
+        R = [r + z @ made.N.T for r, z in zip(made.R, Z, strict=True)]
+        found = _certified(errors.with_innovation(made.V), method, parts, None, gains=R, margin=0.0)
+    except SolverError:
+        return None
+    return replace(found, output=made.V, runs=(*rest.runs, *found.runs), is_fastest=rest.is_fastest)
 
 
 def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synthesis:
@@ -78,6 +101,8 @@ def _synthesis(
     W: FloatArray,
     certificate: VertexCertificate,
     steps: float | None,
+    *,
+    decoupled: bool = False,
 ) -> Synthesis:
     errors, L0, U2 = errors_over_region(parts, W)
     # L0 is that of the pseudoinverse: another W changes R alone.
@@ -92,7 +117,7 @@ def _synthesis(
     if plant.nd:
         claims |= {
             "gamma": certificate.gain_times(parts.reach),
-            "gamma_min": certificate.least * parts.reach,
+            "gamma_min": 0.0 if decoupled else certificate.least * parts.reach,
         }
     return Synthesis(
         options=method.as_plain(),
@@ -100,7 +125,7 @@ def _synthesis(
         observer=observer,
         certificate=Certificate(matrices, claims),
         solver={"engine": "lmi", "runs": list(certificate.runs)},
-        notes=_notes(plant, parts, certificate, steps),
+        notes=_notes(plant, parts, certificate, steps, decoupled=decoupled),
     )
 
 
@@ -185,11 +210,22 @@ def _realised(
 
 
 def _notes(
-    plant: PolytopicSystem, parts: FilterOverRegion, certificate: VertexCertificate, steps: float | None
+    plant: PolytopicSystem,
+    parts: FilterOverRegion,
+    certificate: VertexCertificate,
+    steps: float | None,
+    *,
+    decoupled: bool,
 ) -> tuple[str, ...]:
     notes = [certificate_note(plant, f"{rows_to_forget(certificate.decay)} rows")]
     notes += unused_rate_notes(plant, steps if certificate.witness.G is not None else None)
-    notes += by_product_notes(certificate)
+    if decoupled:
+        notes.append(
+            "No disturbance reaches a fault estimate, for every course of the parameters: the gain is zero but for "
+            "rounding of the stored numbers. The inequalities prove no gain of zero: that of them is "
+            f"{certificate.gain_times(parts.reach):.3g}."
+        )
+    notes += by_product_notes(replace(certificate, is_negligible=certificate.is_negligible and not decoupled))
     if parts.reach != 1.0:
         notes.append(
             f"The effect of the faults changes with the scheduling: the estimates are divided by it, and gamma is the "
