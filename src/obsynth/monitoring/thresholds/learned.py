@@ -119,7 +119,7 @@ class LearnedThresholds:
         Sensors for which none is allowed for all the same, as nothing is known of their noise or of what a drift does.
     drift_limits : mapping of str to float
         Of one log, where no drift is allowed for: by how many deviations of its noise, below one, a slow drift of a
-        sensor alarms for as long as it lasts.
+        sensor alarms for as long as it lasts; with a ``memory``, an offset that is there from the first row on.
     memory : float
         Rows over which slow offsets of the residuals are followed, and twice those over which faults are, so that they
         alarm nothing; zero: none is.  One log does not distinguish drifts of a plant from faults that come as slowly.
@@ -236,10 +236,14 @@ class LearnedThresholds:
             )
         if self.drift_limits:
             limits = " or of ".join(f"{name} by {limit:.2g}" for name, limit in self.drift_limits.items())
+            wrong = (
+                f"an offset from the first row on of {limits} deviations of its noise alarms until it is followed"
+                if self.memory
+                else f"a slow drift of {limits} deviations of its noise alarms as long as it lasts"
+            )
             yield (
-                f"one log does not rule out that sensors drift otherwise in others, and a slow drift of {limits} "
-                "deviations of its noise alarms as long as it lasts: give three normal logs, or allow for it "
-                "(sensor_drift)"
+                f"one log does not rule out that sensors drift otherwise in others, and {wrong}: give three normal "
+                "logs, or allow for it (sensor_drift)"
             )
 
     def _dependence_in_words(self) -> Iterator[str]:

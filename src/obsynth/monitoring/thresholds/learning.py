@@ -180,7 +180,7 @@ def learn_thresholds(
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
     learned = replace(learned, memory=_memory(learned, logs))
-    stays = drifts is None and len(logs.ends) == 1 and not learned.memory
+    is_one_log = drifts is None and len(logs.ends) == 1
     return replace(
         learned,
         notes=(
@@ -190,7 +190,7 @@ def learn_thresholds(
             *_notes_of_starts(design, output, learned),
         ),
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
-        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if stays else {},
+        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if is_one_log else {},
         ranges=_ranges(signals, deviations, output, white, learned, options["logs"]),
     )
 
