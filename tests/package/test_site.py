@@ -72,7 +72,7 @@ def test_a_stranger_with_a_thermal_plant_gets_to_an_alarm(battery, capsys):
     for command in (command for command in commands if "compare" not in command):
         assert main(shlex.split(command)[1:]) == 0
     printed = capsys.readouterr().out
-    assert "the estimate reaches 90 % after: heater fault 730 s" in printed
+    assert "the estimate reaches 90 % after 730 s (heater fault)" in printed
     assert "First alarm 2026-01-12T07:16:00 (threshold of fhat[heater fault])." in printed
     assert (battery / "battery.png").stat().st_size > 10_000
 

@@ -278,10 +278,10 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     reached = [(name, step_figures.most) for name, step_figures in steps.items() if step_figures.reaches]
     digits = 4 if observer.dt > 0.0 else 3
     slow_steps = [
-        f"{name} {number(most, digits=digits)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt
+        f"{number(most, digits=digits)} s ({name})" for name, most in reached if most > (late[name] + 0.5) * observer.dt
     ]
     if slow_steps:
-        yield "step", f"the estimate reaches 90 % after: {listed(slow_steps, most=_MOST_IN_SUMMARY)}"
+        yield "step", f"the estimate reaches 90 % after {listed(slow_steps, most=_MOST_IN_SUMMARY)}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
