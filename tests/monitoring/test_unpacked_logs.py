@@ -214,3 +214,22 @@ def test_a_name_is_one_however_its_letters_are_encoded(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(found, wanted, check_dtype=False)
     with pytest.raises(SpecError, match="no column"):
         obsynth.run_on_data(design, log.rename(columns={mu: "u-flow"}))
+
+
+def test_units_of_a_frame_are_those_of_a_header(design, frame) -> None:
+    plant = design.plant.replace(units={"level": "m", "valve": "V"})
+    made = obsynth.fault_estimation_filter(plant, name="tank")
+    other = frame.assign(level=100.0 * frame["level"], valve=1000.0 * frame["valve"])
+    units = {"time": "s", "valve": "mV", "level": "cm", "flow": ""}
+    marked = other.copy()
+    marked.attrs["units"] = units
+    two_rows = other.set_axis(pd.MultiIndex.from_tuples([(name, units[name]) for name in other]), axis=1)
+    _same(made, marked, frame)
+    _same(made, two_rows, frame)
+    assert np.allclose(log_table(two_rows, ["level"], units={"level": "m"})[0]["level"], frame["level"], rtol=1e-12)
+    wrong = other.copy()
+    wrong.attrs["units"] = {"level": "kg"}
+    with pytest.raises(SpecError, match="level"):
+        obsynth.run_on_data(made, wrong)
+    with pytest.raises(SpecError, match="3 levels"):
+        obsynth.run_on_data(made, frame.set_axis(pd.MultiIndex.from_tuples([(name, "", "") for name in frame]), axis=1))

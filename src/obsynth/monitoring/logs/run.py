@@ -178,6 +178,7 @@ def run_on_data(
         With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``, also
         with ``.gz``), ``.xlsx``, Parquet, TDMS, MDF (``.mf4``, ``.mdf``, ``.dat``), ``.npz`` or ``.mat`` by their
         suffix; a stream is text and is answered row by row.  Frames of polars and tables of pyarrow are taken as well.
+        Units in a second row of the header of a frame, or in ``attrs["units"]``, are read as ``name [unit]``.
         Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma where
         commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone (taken
         as UTC without one), which are written back as such; the index of a frame is the time where it is a

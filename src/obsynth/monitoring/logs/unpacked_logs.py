@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 COMPRESSED_SUFFIXES = (".csv.gz", ".tsv.gz")
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
 
+#: What a second row of a header holds where a column has no unit: nothing, or what pandas and pint-pandas write there.
+NO_UNIT = re.compile(r"\s*(Unnamed: .*|No Unit|nan|None|-)?\s*\Z")
+
 #: How a file that gzip made begins.
 _GZIP = b"\x1f\x8b"
 
@@ -41,13 +45,34 @@ def as_frame(data: Any) -> Any:
     import pandas as pd
 
     if isinstance(data, pd.DataFrame):
-        return data
+        return _with_units(data)
     if isinstance(data, Mapping):
         return _of_columns({str(name): data[name] for name in data}, "data")
     if hasattr(data, "collect") and hasattr(data, "collect_schema"):
         data = data.collect()  # a polars.LazyFrame
     made = data.to_pandas() if hasattr(data, "to_pandas") else data
     return made if isinstance(made, pd.DataFrame) else data
+
+
+def _with_units(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a frame whose columns are called ``name [unit]`` where it states units: in a second row of its header, or
+    by name in ``attrs["units"]``."""
+    header = frame.columns
+    if header.nlevels > 2:
+        raise SpecError(
+            f"The columns of the data have {header.nlevels} levels of names: give one, or names and units.", path="data"
+        )
+    if header.nlevels == 2:
+        names, units = ([str(part) for part in header.get_level_values(level)] for level in (0, 1))
+        units = ["" if NO_UNIT.match(unit) else unit for unit in units]
+    else:
+        stated = frame.attrs.get("units")
+        if not isinstance(stated, Mapping):
+            return frame
+        names = [str(name) for name in header]
+        units = [str(stated.get(name) or "") for name in header]
+    headers = [f"{name} [{unit}]" if unit.strip() else name for name, unit in zip(names, units, strict=True)]
+    return frame.set_axis(headers, axis=1)
 
 
 def _of_columns(columns: Mapping[str, Any], path: str) -> pd.DataFrame:
