@@ -6,6 +6,7 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -48,6 +49,46 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     assert "times the optimum of all tests with its delay on at most 32 samples" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("decay", [0.001, 0.02])
+def test_no_record_passes_the_bound_of_an_observer_that_is_slower_than_the_plant(seed: int, decay: float) -> None:
+    """Responses were followed for some settling times of the plant: of slow observers a small part of them."""
+    rng = np.random.default_rng([46, seed])
+    n = int(rng.integers(1, 4))
+    A = rng.standard_normal((n, n))
+    plant = obsynth.DescriptorSystem(
+        A=0.3 * A / np.abs(np.linalg.eigvals(A)).max(), C=np.eye(n), Bf=np.ones((n, 1)), dt=1.0,
+        sensor_noise={f"y{i + 1}": 0.1 for i in range(n)},
+    )  # fmt: skip
+    design = obsynth.functional_filter(plant, decay=decay)
+    scenario = obsynth.Scenario(horizon=50, noise=1.0)
+    bound = design_beside_least(design, scenario)["f1"][0]
+    (entry,) = obsynth.compare(
+        plant, methods=["functional-filter"], options={"functional-filter": {"decay": decay}}, runs=2
+    ).methods
+    observer, steps = design.observer, 20_000
+    # Noise at three deviations in every sample, with the sign of its effect on the last estimate.
+    worst, ahead = np.abs(observer.Dy[observer.fault_rows][0]).sum(), observer.Cz[observer.fault_rows][0]
+    for _ in range(steps):
+        worst, ahead = worst + np.abs(ahead @ observer.By).sum(), ahead @ observer.Az
+    for stated in (bound, entry.faults[0].bound):
+        assert 0.3 * worst * (1.0 - 1e-9) <= stated <= 0.3 * worst * (1.0 + 1e-5)
+
+
+def test_a_comparison_says_that_gains_which_move_are_taken_once_they_have_settled() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1}, noise_names=["n1"]
+    )
+    methods = ["adaptive-observer", "functional-filter"]
+    comparison = obsynth.compare(plant, methods=methods, options={methods[0]: {"Q": 0.01}}, runs=2)
+    observer = comparison[methods[0]].design.observer
+    # Noise that is largest at the start, with the signs of its effects on the third estimate.
+    effects = [observer.run(0.3 * np.eye(6)[:, [k]]).faults[:, 0] for k in range(6)]
+    assert np.abs(effects).sum(axis=0).max() > comparison[methods[0]].faults[0].bound
+    assert "Figures of adaptive-observer are those of gains that have settled" in comparison.meanings()
+    assert "have settled" not in obsynth.compare(plant, methods=methods[1:], runs=2).meanings()
 
 
 @pytest.mark.long

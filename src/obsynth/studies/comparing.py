@@ -59,7 +59,7 @@ from obsynth.studies.equal_delays import (
     level_of_normal_rows,
     normal_rows,
 )
-from obsynth.studies.least_thresholds import thresholds_beside_least
+from obsynth.studies.least_thresholds import response_steps, thresholds_beside_least
 
 #: Runs of the scenario, and samples and settling times where nothing is stated.
 RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000
@@ -430,9 +430,10 @@ def _compared(
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
     observer = entry.observer
-    impulses, responses = step_responses(plant, observer, *loop)
+    _, responses = step_responses(plant, observer, *loop)
     names = [figures.fault for figures in entry.figures]
-    beside = thresholds_beside_least(plant, impulses, names, bounds)
+    followed, radius = response_steps(plant, observer, loop[0])
+    beside = thresholds_beside_least(plant, step_responses(plant, observer, *followed)[0], names, bounds, radius)
     estimated, quiet = estimates(observer, faulty), estimates(observer, healthy)
     replay = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
     replayed = None if replay is None else replay[0]

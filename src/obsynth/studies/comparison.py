@@ -17,6 +17,7 @@ from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import fields_suggested, there_are
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.report.plots.panels import (
     LINE_COLOURS,
     TRUE_STYLE,
@@ -397,7 +398,22 @@ class Comparison:
         """
         columns_drawn = self._header if columns is None else columns
         texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns_drawn if name in _FIGURE_MEANINGS]
-        return "; ".join(texts) + f". {_OF_THE_EXACT_MODEL}"
+        return " ".join(filter(None, ("; ".join(texts) + ".", _OF_THE_EXACT_MODEL, self._of_settled_gains)))
+
+    @property
+    def _of_settled_gains(self) -> str:
+        """Which methods have figures that do not cover the first samples, in a sentence; empty for none."""
+        moving = [
+            entry.method
+            for entry in self.methods
+            if entry.design is not None and not isinstance(entry.design.observer, LinearObserver)
+        ]
+        if not moving:
+            return ""
+        return (
+            f"Figures of {', '.join(moving)} are those of gains that have settled: before that, estimates may pass the "
+            "bound."
+        )
 
     @property
     def beside_the_least(self) -> tuple[str, ...]:

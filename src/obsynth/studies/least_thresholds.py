@@ -29,8 +29,12 @@ DEVIATIONS = 3.0
 #: What a response may differ from one sample of the fault, and be taken as it.
 SAME_RESPONSE = 1e-6
 
-#: A response is followed for `SETTLING_TIMES`, and for so many steps at most.
-MOST_RESPONSE_STEPS = 6000
+#: A response is followed for `SETTLING_TIMES` and until its slowest mode is below this share, far below what is
+#: printed, and for so many steps at most.
+DECAYED, MOST_RESPONSE_STEPS = 1e-12, 20_000
+
+#: No bound is known where the rest of a response is more than this share of it: less than the digits that are printed.
+LARGEST_REST = 1e-6
 
 
 def thresholds_beside_least(
@@ -38,22 +42,31 @@ def thresholds_beside_least(
     impulses: FloatArray,
     faults: Sequence[str],
     bounds: FloatArray,
+    radius: float,
     moving: FloatArray | None = None,
 ) -> list[tuple[float, float]]:
     """Return for each estimate what it never passes without a fault, and the least that any test with its delay has.
 
-    ``plant`` sampled; ``impulses (steps, estimates, nf + nd + nw)`` as of `step_responses`; ``bounds (nd,)`` of the
-    disturbances, noise within `DEVIATIONS`.  Disturbances are held between samples, or move with the gains ``moving
-    (estimates, nd)`` of `moving_gains`.  The first is a sum of absolute values; NaN where none is known.
+    ``plant`` sampled; ``impulses (steps, estimates, nf + nd + nw)`` as of `step_responses`, which shrink from step to
+    step by ``radius`` in the end; ``bounds (nd,)`` of the disturbances, noise within `DEVIATIONS`.  Disturbances are
+    held between samples, or move with the gains ``moving (estimates, nd)`` of `moving_gains`.  The first is a sum of
+    absolute values; NaN where none is known.
     """
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     noise = np.full(impulses.shape[2] - plant.nf - plant.nd, DEVIATIONS if noisy else 0.0)
+    sizes = np.concatenate([np.zeros(plant.nf), bounds, noise])
+    quarter = -(-len(impulses) // 4)
+    later = radius**quarter / (1.0 - radius**quarter)
     pairs = []
     for row, name in enumerate(faults):
         gains = np.abs(impulses[:, row]).sum(axis=0)
         if moving is not None:
             gains[plant.nf : plant.nf + plant.nd] = moving[row]
-        bound = float(gains[plant.nf :] @ np.concatenate([bounds, noise]))
+        bound = float(gains[plant.nf :] @ sizes[plant.nf :])
+        if later * float(np.abs(impulses[-quarter:, row, plant.nf :]).sum(axis=0) @ sizes[plant.nf :]) > (
+            LARGEST_REST * bound
+        ):
+            bound = float("nan")
         response = impulses[:, row, plant.fault_names.index(name)]
         lag = int(np.argmax(np.abs(response) > SAME_RESPONSE))
         alone = (
@@ -70,6 +83,19 @@ def thresholds_beside_least(
             )
         )
     return pairs
+
+
+def response_steps(
+    plant: DescriptorSystem, observer: LinearObserver, steps: int
+) -> tuple[tuple[int, FloatArray], float]:
+    """Return for how many steps, ``steps`` at least, and with which feedback responses of a sampled plant are followed,
+    as of `steps_in_bounds`, and the radius of the slowest mode of plant and observer that decays."""
+    sizes = np.abs(np.concatenate([np.linalg.eigvals(part) for part in (plant.A, observer.Az)]))
+    radius = float(np.max(sizes[sizes < 1.0], initial=0.0))
+    more = observer.order + 2
+    if radius > 0.0:
+        more += int(min(np.log(DECAYED) / np.log(radius), MOST_RESPONSE_STEPS))
+    return steps_in_bounds(plant, max(steps, min(more, MOST_RESPONSE_STEPS))), radius
 
 
 def moving_gains(
@@ -166,14 +192,14 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
     try:
         sampled = on_the_clock(plant, plant.dt)
         steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_RESPONSE_STEPS))
-        steps, feedback = steps_in_bounds(sampled, steps)
+        (steps, feedback), radius = response_steps(sampled, observer, steps)
         impulses, _ = step_responses(sampled, observer, steps, feedback)
         bounds = largest_disturbances(scenario, sampled.disturbance_names, steps, plant.dt)
         moving = moving_gains(sampled, observer, steps, feedback)
-        pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds, moving)
+        pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds, radius, moving)
     except ObsynthError:
         return {}
-    return dict(zip(observer.fault_names, pairs, strict=True))
+    return {name: pair for name, pair in zip(observer.fault_names, pairs, strict=True) if np.isfinite(pair[0])}
 
 
 def is_moving(design: ObserverDesign) -> bool:
