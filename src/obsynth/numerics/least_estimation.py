@@ -9,6 +9,7 @@ solution of the right signs exactly when a causal filter of gain below g exists 
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from obsynth.errors import PreconditionError, SolverError
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.decoupling_windows import EstimationProblem, Model
 from obsynth.numerics.gramians import gramian
+from obsynth.numerics.least_level import place_of_zero_margin
 from obsynth.numerics.matrix_equations import discrete_riccati
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import hinf_norm
@@ -42,6 +44,9 @@ UNSTABLE_ZERO = (
 #: The bisection of the level ends at this share.
 LEVEL_SHARE = 1e-8
 MOST_LEVELS = 60
+#: The next level is this share of what two estimates of the least one differ by above the better estimate, and each
+#: time that one fails so many times farther, until after so many failures the bracket is halved.
+ESTIMATE_SHARE, CAUTION, MOST_FAILURES = 0.2, 10.0, 3
 #: Extra noise, of the size of the matrices, for problems in which some output is measured without noise.
 ADDED_NOISES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 #: A Kalman filter whose errors last longer than this is taken as not stable.
@@ -295,8 +300,9 @@ def _deviation(system: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) ->
     return float(np.sqrt(max(np.trace(d @ d.T + c @ covariance @ c.T), 0.0)))
 
 
-def _at_level(problem: EstimationProblem, level: float) -> FloatArray | None:
-    """Return the stabilising solution of the filtering equation at a level, or ``None`` where no filter is below it."""
+def _at_level(problem: EstimationProblem, level: float) -> tuple[FloatArray, float] | None:
+    """Return the stabilising solution of the filtering equation at a level, or ``None`` where no filter is below it,
+    and by how much what must be negative is so, as a share of the squared level."""
     rows = len(problem.C)
     CL, DD = np.vstack([problem.C, problem.L]), np.vstack([problem.D, problem.D1])
     weight = DD @ DD.T
@@ -312,35 +318,53 @@ def _at_level(problem: EstimationProblem, level: float) -> FloatArray | None:
     if rows and np.linalg.eigvalsh(innovation)[0] <= 0.0:
         return None
     schur = error - (mixed.T @ np.linalg.solve(innovation, mixed) if rows else 0.0)
-    if np.linalg.eigvalsh(0.5 * (schur + schur.T))[-1] >= 0.0:
+    largest = float(np.linalg.eigvalsh(0.5 * (schur + schur.T))[-1])
+    if largest >= 0.0:
         return None
     closed = problem.A - _central(problem, P)[0] @ problem.C
-    return P if np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0 else None
+    return (P, -largest / level**2) if np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0 else None
 
 
 def _search(
     problem: EstimationProblem, first: tuple[FloatArray, FloatArray], least: float, high: float
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Bisect the level between a lower bound and the norm of the H2 filter; a level counts as the true norm says."""
+    """Search the level between a lower bound and the norm of the H2 filter; a level counts as the true norm says."""
     nothing = ZERO_SHARE * max(float(np.linalg.norm(problem.D1)), float(np.linalg.norm(problem.L @ problem.B)), high)
     if high <= max(least * (1.0 + LEVEL_SHARE), nothing):
         return None
     low, best = least * (1.0 - BOUND_ROUNDING), None
-    for tried in range(MOST_LEVELS):
-        level = 0.5 * (low + high) if tried else least * (1.0 + 3.0 * LEVEL_SHARE)
+    level, reached, failed = least * (1.0 + 3.0 * LEVEL_SHARE), list[tuple[float, float]](), 0
+    for _ in range(MOST_LEVELS):
         level = level if low < level < high else 0.5 * (low + high)
-        P = _at_level(problem, level)
-        if P is None:
-            low = level
+        solved = _at_level(problem, level)
+        gains = None if solved is None else _central(problem, solved[0])
+        if solved is None or gains is None or _norm(_error_system(problem, *gains)) > level * (1.0 + NORM_ABOVE_LEVEL):
+            low, failed = level, failed + 1
         else:
-            gains = _central(problem, P)
-            if _norm(_error_system(problem, *gains)) <= level * (1.0 + NORM_ABOVE_LEVEL):
-                high, best = level, gains
-            else:
-                low = level
+            high, best, failed = level, gains, 0
+            reached = [*reached[-2:], (float(level**2), float(solved[1] * level**2))]
         if high - low <= LEVEL_SHARE * high or high <= nothing:
             break
+        level = _next_level(reached, low, high, failed)
     return None if best is None else (*best, high)
+
+
+def _next_level(reached: list[tuple[float, float]], low: float, high: float, failed: int) -> float:
+    """Return a level just above where the margin vanishes, by the last levels with their squares and margins."""
+    points = reached[::-1]
+    if len(points) < 2 or failed > MOST_FAILURES or len({margin for _, margin in points}) < len(points):
+        return 0.5 * (low + high)
+    if not failed and points[1][0] - points[0][0] <= 4.0 * LEVEL_SHARE * points[0][0]:
+        # A level next to the one before was reached: margins so near to each other tell nothing.
+        return 0.5 * (low + high)
+    zeros = [place_of_zero_margin(points[:count]) for count in range(2, len(points) + 1)]
+    if failed and zeros[-1] <= low**2:
+        return 0.5 * (low + high)
+    nearest, zero = (max(zero, low**2) for zero in (zeros[0], zeros[-1]))
+    distance = abs(zero - nearest) if len(zeros) > 1 else high**2 - zero
+    step = CAUTION**failed * max(ESTIMATE_SHARE * distance, LEVEL_SHARE * zero)
+    level = math.sqrt(zero + step)
+    return min(level, high * (1.0 - 0.9 * LEVEL_SHARE))
 
 
 def _responses(problem: EstimationProblem, angles: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -434,9 +458,10 @@ def _invisible_from_rest(problem: EstimationProblem) -> float:
 
 def _decays(problem: EstimationProblem, level: float) -> NDArray[np.complex128]:
     """Return the eigenvalues of Phi of the Riccati solution at a level; none where there is no solution."""
-    rows, P = len(problem.C), _at_level(problem, level)
-    if P is None or not len(P):
+    rows, solved = len(problem.C), _at_level(problem, level)
+    if solved is None or not len(solved[0]):
         return np.zeros(0, dtype=complex)
+    P = solved[0]
     CL, DD = np.vstack([problem.C, problem.L]), np.vstack([problem.D, problem.D1])
     R = CL @ P @ CL.T + DD @ DD.T
     R[rows:, rows:] -= level**2 * np.eye(len(problem.L))

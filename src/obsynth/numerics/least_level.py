@@ -110,8 +110,8 @@ class GammaIteration:
         u, m = points[0]
         zeros = [max(u - m, self.low**2)]
         if len(points) > 1:
-            zeros.append(max(zeros[0], _place_of_zero_margin(points[:2])))
-        if len(points) > 2 and zeros[0] <= (parabola := _place_of_zero_margin(points)) <= 0.5 * (zeros[1] + u):
+            zeros.append(max(zeros[0], place_of_zero_margin(points[:2])))
+        if len(points) > 2 and zeros[0] <= (parabola := place_of_zero_margin(points)) <= 0.5 * (zeros[1] + u):
             zeros.append(parabola)
         zero = zeros[-1]
         distance = abs(zero - zeros[1]) if len(zeros) > 2 else u - zero
@@ -165,7 +165,7 @@ class GammaIteration:
         return gain if gain <= level * (1.0 + self.tolerance) else None
 
 
-def _place_of_zero_margin(points: list[tuple[float, float]]) -> float:
+def place_of_zero_margin(points: list[tuple[float, float]]) -> float:
     """Return where u is for a margin of zero, by the polynomial in the margin through points (u, margin)."""
     total = 0.0
     for i, (u, margin) in enumerate(points):
