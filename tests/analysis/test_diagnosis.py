@@ -13,7 +13,7 @@ from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decoupled_fault
 from obsynth.analysis.diagnosis.explanations import hidden_motion, hiding_amplitudes
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
-from obsynth.numerics.ranks import TRACE_TOLERANCE
+from obsynth.numerics.ranks import TRACE_TOLERANCE, decide_rank
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 
@@ -338,3 +338,12 @@ def test_the_gap_of_a_question_knows_how_small_a_trace_is() -> None:
     assert found.leaves_trace
     assert found.gap == pytest.approx(found.trace / TRACE_TOLERANCE)
     assert found.gap < found.plant.thinnest.gap
+
+
+def test_no_order_is_printed_for_a_filter_that_does_not_exist() -> None:
+    hidden = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], Bd=[[1.0]], dt=1.0)
+    assert obsynth.diagnose(hidden).verdict_rows()[1] == ("f1", "no", "no", "no", "no", "-", "-", "-")
+
+
+def test_a_rank_that_no_rounding_can_change_is_described_without_a_gap() -> None:
+    assert decide_rank(np.diag([1.0, 0.0]), expected=2).describe() == "rank 1 of 2"

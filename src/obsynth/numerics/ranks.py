@@ -212,7 +212,8 @@ class RankDecision:
         if self.means == "unclear":
             return f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}"
         note = "" if self.clear else ", unclear: check the scaling of the data"
-        return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
+        gap = f" (gap {self.gap:.1e}{note})" if np.isfinite(self.gap) else ""
+        return f"rank {self.rank} of {self.expected}{gap}"
 
 
 def equilibrate(matrix: FloatArray) -> FloatArray:

@@ -185,7 +185,9 @@ class TimeVaryingDescriptorSystem:
             It is continuous in time or has disturbances.
         """
         if not plant.is_discrete:
-            raise SpecError("The plant is continuous in time: discretise it first (transform.sample_time).", path="dt")
+            raise SpecError(
+                "The plant is continuous in time: sample it first (transform: {sample_time: ...}).", path="dt"
+            )
         if plant.nd:
             raise SpecError(
                 "The plant has unknown disturbances, which this method does not cover: remove Bd and Dd, or make them "

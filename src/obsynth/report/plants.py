@@ -223,6 +223,7 @@ def method_lines(
             yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + own_method, "yellow"
         elif _OF_THIS_KIND in names:
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
+            reason = reason.replace("The plant", "the plant", 1) if reason.startswith("The plant") else reason
             yield method, f"not for this plant{own_method}: {reason}".rstrip("."), "yellow"
         elif names & _ASKED:
             reason = " ".join(check.detail for check in failed if check.name in _ASKED)

@@ -242,7 +242,7 @@ class Diagnosis:
                 _word(fault.estimable),
                 _count(fault.order),
                 _count(fault.residual_order),
-                str(fault.filter_order),
+                str(fault.filter_order) if fault.estimable or fault.step_estimable else "-",
             )
             for fault in self.faults
         ]
