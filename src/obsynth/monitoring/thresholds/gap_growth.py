@@ -125,22 +125,24 @@ def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -
 
     Between samples they may do anything: the states take their mean, and the outputs their value at the sample; what
     the states take besides the mean is ``int (e^(A s) b - mean) d ds``, of at most ``L h^2 / 3`` for the largest slope
-    L of ``e^(A s) b``, state by state.
+    L of ``e^(A s) b``, state by state.  States after those of the continuous plant hold readings that are late: they
+    take the value at the sample.
     """
     plant, sampled = errors.plant, model.sampled
     if sampled is None:
         return plant.Bd * sizes, plant.Dd * sizes
-    a, h, none = sampled.plant.A, sampled.dt, np.zeros((plant.nx, plant.nd))
+    a, h, n = sampled.plant.A, sampled.dt, sampled.plant.nx
     count = max(1, int(np.ceil(np.abs(a).sum(axis=1).max(initial=0.0) * h / SLOPE_PIECE)))
     from scipy.linalg import expm
 
     step, wider = expm(a * h / count), expm(np.abs(a) * h / count)
-    slope, largest = a @ sampled.plant.Bd, np.zeros((plant.nx, plant.nd))
+    slope, largest = a @ sampled.plant.Bd, np.zeros((n, plant.nd))
     for _ in range(count):
         largest, slope = np.maximum(largest, wider @ np.abs(slope)), step @ slope
-    deviation = np.diag((largest @ sizes) * h**2 / 3.0)
-    outputs = np.zeros((plant.ny, plant.nd)), plant.Dd * sizes, np.zeros((plant.ny, plant.nx))
-    return np.hstack([plant.Bd * sizes, none, deviation]), np.hstack(outputs)
+    mean, value, deviation = plant.Bd * sizes, plant.Bd * sizes, np.zeros((plant.nx, n))
+    mean[n:], value[:n], deviation[:n] = 0.0, 0.0, np.diag((largest @ sizes) * h**2 / 3.0)
+    outputs = np.zeros((plant.ny, plant.nd)), plant.Dd * sizes, np.zeros((plant.ny, n))
+    return np.hstack([mean, value, deviation]), np.hstack(outputs)
 
 
 def _stand_in(errors: ErrorModel, Bq: FloatArray, Dq: FloatArray) -> tuple[FloatArray, FloatArray]:
