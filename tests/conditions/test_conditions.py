@@ -266,7 +266,7 @@ BAD = {
     "a plant": (lambda: conditions.wang2015("plant"), "give an obsynth.DescriptorSystem"),
     "no constraint": (lambda: unsolved().changed(constraints=[3.0]), "is a float: give cvxpy constraints"),
     "no list": (lambda: unsolved().changed(constraints=3.0), "give a list of cvxpy constraints"),
-    "unknown name": (lambda: unsolved().changed(drop=["(44)"]), r"no constraint '\(44\)'; there are: 'P', '\(45\)'"),
+    "unknown name": (lambda: unsolved().changed(drop=["(44)"]), r"no constraint '\(44\)'; .* Did you mean '\(45\)'"),
     "no objective": (lambda: unsolved().changed(objective="least gains"), "give cvxpy.Minimize"),
 }  # fmt: skip
 

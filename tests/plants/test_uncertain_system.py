@@ -44,7 +44,7 @@ def test_nominal_values_and_ranges() -> None:
         ({"k": 2.0, "m": 1.0, "spring": (1.0, 2.0)}, "'spring' appears in no matrix"),
         ({"k": {"nominal": 3.0, "range": [1.0, 2.0]}, "m": 1.0}, "outside its range"),
         ({"k": {"nominal": 2.0, "tolerance": "5 %", "range": [1.0, 2.0]}, "m": 1.0}, "both"),
-        ({"k": {"nominal": 2.0, "spread": 1.0}, "m": 1.0}, "'spread' is unknown"),
+        ({"k": {"nominal": 2.0, "spread": 1.0}, "m": 1.0}, "no key 'spread'; there are: nominal"),
     ],
 )  # fmt: skip
 def test_refused_constants(constants: dict, words: str) -> None:

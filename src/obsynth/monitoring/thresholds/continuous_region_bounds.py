@@ -19,6 +19,7 @@ from obsynth.monitoring.thresholds.euler_bounds import EulerErrorBound, PlantMot
 from obsynth.monitoring.thresholds.euler_rule import EulerRule, ResidualBound
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.noise import require_noise
@@ -244,8 +245,6 @@ def _proved(design: ObserverDesign, models: list[ErrorModel], inputs: _Inputs) -
 
 def _ellipsoids(A: FloatArray, inputs: FloatArray) -> list[FloatArray]:
     """Return inverses of Gramians of the middle of the region, with rates along a line."""
-    from scipy.linalg import solve_continuous_lyapunov
-
     slowest = -float(np.max(np.linalg.eigvals(A).real)) if len(A) else 0.0
     if not slowest > 0.0:
         return []
@@ -255,7 +254,7 @@ def _ellipsoids(A: FloatArray, inputs: FloatArray) -> list[FloatArray]:
     for interior in INTERIORS:
         for share in RATES:
             rate = share * slowest
-            X = solve_continuous_lyapunov(A + rate * np.eye(len(A)), -(squares + interior * largest * np.eye(len(A))))
+            X = continuous_lyapunov(A + rate * np.eye(len(A)), -(squares + interior * largest * np.eye(len(A))))
             try:
                 made.append(np.asarray(np.linalg.inv(0.5 * (X + X.T))))
             except np.linalg.LinAlgError:
