@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from benchmarks.campaigns._written_plants import (
     NOISE_BOUND,
+    PARTS_OF_DELAYS,
     WrittenPlant,
     effects,
     held,
@@ -233,12 +234,14 @@ def step_test(plant: WrittenPlant, *, before: int, after: int, is_held: bool) ->
 
 def better_test(plant: WrittenPlant, design: ob.ObserverDesign, least: float, *, is_held: bool) -> str:
     """Return by how much a test with the delay of a design is better than a least; of a fault of any time course where
-    the estimate is one sample of it, else of a constant one."""
-    states, faults = _of_window(plant, LONGEST)
-    own = weights_of(design, LONGEST, row=0).ravel() @ faults
-    at = LONGEST - 1 - design.linear[1].fault_delays[0]
+    the estimate is one sample of it, else of a constant one.  Inputs of the window alone are known: tests have nothing
+    of its first outputs, which earlier ones move where inputs act late."""
+    samples = LONGEST + -plant.delays[0] // PARTS_OF_DELAYS
+    states, faults = _of_window(plant, samples)
+    own = weights_of(design, samples, row=0).ravel() @ faults
+    at = samples - 1 - design.linear[1].fault_delays[0]
     if abs(own[at] - 1.0) < ZERO and np.sum(np.abs(np.delete(own, at))) < ZERO:
-        wanted, values = np.hstack([states, faults]), np.concatenate([np.zeros(states.shape[1]), np.eye(LONGEST)[at]])
+        wanted, values = np.hstack([states, faults]), np.concatenate([np.zeros(states.shape[1]), np.eye(samples)[at]])
         kept = np.any(wanted != 0.0, axis=0)
         wanted, values = wanted[:, kept], values[kept]
     else:

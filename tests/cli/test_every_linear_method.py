@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,15 @@ import obsynth
 from obsynth.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-#: Shorter scenarios for specs whose own are long.
+#: Horizons of shorter scenarios for specs whose own are long.
 SCENARIOS = {
-    "filasova/spec.yaml": "horizon: 4",
-    "smib/spec.yaml": "horizon: 2",
-    "kundur/spec.yaml": "horizon: 2",
-    "smib/pd_observer.yaml": "horizon: 2",
-    "sharepasand/spec.yaml": "horizon: 8",
-    "moussaali2013_ltv/spec.yaml": "horizon: 299",
-    "smib/spec_inertia.yaml": "horizon: 20",
+    "filasova/spec.yaml": 4,
+    "smib/spec.yaml": 2,
+    "kundur/spec.yaml": 2,
+    "smib/pd_observer.yaml": 2,
+    "sharepasand/spec.yaml": 8,
+    "moussaali2013_ltv/spec.yaml": 299,
+    "smib/spec_inertia.yaml": 20,
 }
 #: Shorter horizons of plants that vary with time, in samples: a design goes along all of them.
 HORIZONS = {
@@ -70,8 +71,11 @@ def spec_of(name: str, folder: Path) -> Path:
     text = source.read_text(encoding="utf-8").split("scenario:")[0]
     own = source.read_text(encoding="utf-8").partition("scenario:")[2]
     target = folder / source.name
-    lines = [f"  {SCENARIOS[name]}" if line.lstrip().startswith("horizon:") else line for line in own.splitlines()]
-    target.write_text("\n".join([text, "scenario:", *lines, ""]), encoding="utf-8")
+    horizon = re.search(r"horizon: ([\d.]+)", own)
+    assert horizon is not None
+    share = SCENARIOS[name] / float(horizon[1])
+    shorter = re.sub(r"\b(horizon|start|end): ([\d.]+)", lambda time: f"{time[1]}: {share * float(time[2]):g}", own)
+    target.write_text(f"{text}scenario:{shorter}", encoding="utf-8")
     return target
 
 

@@ -46,7 +46,7 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
         assert f" {row[header.index(name)]}" in printed.getvalue()
     assert "…" not in printed.getvalue()
     assert main(["evaluate", "--system", str(DRIVE), "--runs", "2", "--quiet"]) == 0
-    assert "times the optimum of all tests with its delay on at most 32 samples" in " ".join(
+    assert "times the optimum of all tests with its delay on at most 32 samples of inputs and outputs" in " ".join(
         capsys.readouterr().out.split()
     )
 

@@ -102,8 +102,8 @@ _FIGURE_MEANINGS = {
     "smallest": "step that half of the runs detect",
     "bound": "largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances",
     "bound / optimum": (
-        f"1 = as sensitive as the best {LONGEST_WINDOW}-sample test with the same delay; below 1 = better, because the "
-        "observer uses older samples"
+        f"1 = as sensitive as the best test with the same delay on {LONGEST_WINDOW} samples of inputs and outputs (on "
+        "fewer of plants with more than 78 states); below 1 = better, because the observer uses older samples"
     ),
     "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
     EQUAL_DELAY: (
@@ -152,9 +152,10 @@ class FaultComparison:
         What the estimate of the exact model never passes without a fault, with disturbances as large as in the scenario
         that are held between samples, and three deviations of noise: sums of absolute values.
     least : float
-        The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples can have, linear or
-        not: of a fault of any time course where the estimate is one sample of it, else of a constant one.  An observer
-        uses all samples before, and its bound may be smaller.
+        The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples of inputs and outputs
+        can have (fewer of plants with more than 78 states), linear or not: of a fault of any time course where the
+        estimate is one sample of it, else of a constant one.  An observer uses all samples before, and its bound may be
+        smaller.
     equal_delay : float, seconds
         On a log: from the fault to its alarm, with the level that 1 % of the normal rows pass; median over its begins,
         infinite where it is not found.

@@ -135,7 +135,7 @@ def _least(
 ) -> float:
     """Return the least threshold: of a fault of any time course told after a lag, else of a constant one."""
     time_course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
-    samples = max(min(LONGEST_WINDOW, MOST_WINDOW_STATES // max(plant.nx, 1)), (lag or 0) + 2)
+    samples = max(window_length(plant), (lag or 0) + 2)
     try:
         test = GuaranteedTestMethod.of(
             {
@@ -154,11 +154,23 @@ def _least(
     return size if np.isfinite(size) else float("nan")
 
 
+def window_length(plant: DescriptorSystem) -> int:
+    """Return how many samples of inputs and outputs tests have, whose least is computed."""
+    return min(LONGEST_WINDOW, MOST_WINDOW_STATES // max(plant.nx, 1))
+
+
 def in_words(
-    fault: str, bound: float, least: float, unit: str = "", *, moving: bool = False, noisy: bool = False
+    fault: str,
+    bound: float,
+    least: float,
+    unit: str = "",
+    *,
+    moving: bool = False,
+    noisy: bool = False,
+    samples: int = LONGEST_WINDOW,
 ) -> str:
     """Return a sentence on one fault; ``moving``: whether disturbances move between samples; ``noisy``: whether the
-    plant has noise, which counts as within `DEVIATIONS`."""
+    plant has noise, which counts as within `DEVIATIONS`; ``samples``: of the tests, see `window_length`."""
     size = f"{upper_number(bound, digits=3)}{f' {unit}' if unit else ''}"
     motion = "move within their bounds" if moving else "are held"
     noise = (
@@ -175,8 +187,8 @@ def in_words(
     if least <= SAME_RESPONSE * bound:
         return f"{own}. A test immune to disturbances and noise exists (guaranteed-test)."
     return (
-        f"{own}, {bound / least:.2f} times the optimum of all tests with its delay on at most {LONGEST_WINDOW} "
-        f"samples ({least:.4g})."
+        f"{own}, {bound / least:.2f} times the optimum of all tests with its delay on at most {samples} "
+        f"samples of inputs and outputs ({least:.4g})."
     )
 
 

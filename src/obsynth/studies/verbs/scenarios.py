@@ -162,7 +162,7 @@ def _monitor_data(watched: Monitor | ParameterMonitor | None) -> dict[str, Any] 
 
 def _least_thresholds(design: ObserverDesign, scenario: Scenario) -> tuple[dict[str, Any], list[str]]:
     """Return each fault's bound beside the least possible one, as data and as sentences."""
-    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving
+    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving, window_length
 
     least = design_beside_least(design, scenario)
     if not least:
@@ -170,7 +170,8 @@ def _least_thresholds(design: ObserverDesign, scenario: Scenario) -> tuple[dict[
     (plant, _), units, moving = design.linear, design.plant.units, is_moving(design)
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     data = {name: {"bound": bound, "least": lowest, "moving": moving} for name, (bound, lowest) in least.items()}
-    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving, noisy=noisy) for name, pair in least.items()]
+    settings: dict[str, Any] = {"moving": moving, "noisy": noisy, "samples": window_length(plant)}
+    sentences = [in_words(name, *pair, units.get(name, ""), **settings) for name, pair in least.items()]
     return data, sentences
 
 
