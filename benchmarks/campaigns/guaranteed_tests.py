@@ -20,7 +20,13 @@ from scipy.linalg import block_diag
 import obsynth as ob
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
-from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before, thresholds_over_tolerances, tracked
+from obsynth.methods.guaranteed_test.tolerant import (
+    noisy_as_bounded,
+    over_the_box,
+    rows_before,
+    thresholds_over_tolerances,
+    tracked,
+)
 from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 
 CASES = 625
@@ -138,8 +144,9 @@ def tolerant_case(rng: np.random.Generator) -> Outcome:
         run = design.observer.run(rows[:, 1:], rows[:, :1])
         residual = np.abs(np.hstack([run.faults, run.residuals])[:, -1])
         limits = thresholds_over_tolerances(
-            noisy_as_bounded(window), design.observer, both, window.bounds.disturbance, rows
-        )[:, -1]
+            over_the_box(noisy_as_bounded(window), window.test_problem.disturbance), design.observer, both,
+            window.bounds.disturbance, rows,
+        )[:, -1]  # fmt: skip
         if np.any(residual[filled:] > limits[filled:]):
             return Outcome(group, "threshold least", f"a plant of the box passes by {np.max(residual / limits):.9g}")
         if np.min(limits) < design.threshold * (1.0 - REACHED):
