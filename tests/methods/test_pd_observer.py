@@ -161,6 +161,21 @@ class TestOptions:
             fast = np.linalg.norm(np.linalg.solve(d, l)[PLANT.nx :], 2)
             assert design.report["fast noise in the fault estimate"].value == pytest.approx(fast, rel=1e-9)
 
+    @pytest.mark.parametrize("scale", [0.5, 2.0])
+    def test_noise_of_a_stated_decay_does_not_follow_the_unit_of_an_output(self, scale: float) -> None:
+        """In a unit twice as large the smallest gains had six times the noise at the estimate."""
+        plant = obsynth.DescriptorSystem(
+            A=[[-1.278, -2.419, 1.611], [-0.182, -2.301, 0.959], [-0.121, 1.05, -2.526]], C=[[-1.027, 1.98, 0.678]],
+            Bf=[[1.004], [-0.909], [0.012]], Bw=np.zeros((3, 1)), Dw=[[0.1]],
+        )  # fmt: skip
+        scaled = plant.replace(C=scale * plant.C, Dw=scale * plant.Dw)
+        direct = [
+            float(np.abs(design.observer.Dy[design.observer.fault_rows] @ design.plant.Dw).item())
+            for design in (obsynth.pd_observer(each, decay=0.3) for each in (plant, scaled))
+        ]
+        assert direct[1] == pytest.approx(direct[0], rel=1e-3)
+        assert direct[0] < 0.003
+
     def test_noise_and_disturbance_as_the_plant_states_them(self) -> None:
         design = obsynth.pd_observer(rich(), noise_gain=0.5, fault_rate_gain=2.0)
         plant, gains = design.plant, design.gains
