@@ -98,6 +98,10 @@ def test_large_plants_have_the_answer_of_a_design() -> None:
     with pytest.raises(ob.PreconditionError, match="Errors do not decay"):
         method.require_stated(growing)
     method.require_stated(decaying)
+    # A mode that grows is corrected as soon as it is not known exactly, whatever Q is.
+    unknown = method_class("descriptor-kalman").of({"Q": 0.0, "R": 0.1})
+    unknown.require_stated(growing)
+    assert ob.design(growing, "descriptor-kalman", Q=0.0, R=0.1).certificate.claims["contraction"] < 0.9
 
 
 def test_a_question_without_options_is_one_about_the_plant() -> None:

@@ -36,7 +36,7 @@ from obsynth.results.design import Certificate
 
 #: Information on the parameters in a window below this share of their prior's is as good as none.
 LOST_EXCITATION = 1.0
-#: Of plants of more states gains are formed only where their steady state is not sure: of 196 states it takes two
+#: Of plants of more states gains are formed only where it is not sure that errors decay: of 196 states it takes two
 #: seconds.
 MOST_STATES_TO_FORM_GAINS = 60
 
@@ -62,27 +62,33 @@ def synthesise(
 def require_gains(plant: DescriptorSystem | TimeVaryingDescriptorSystem, method: Method) -> None:
     """Raise `PreconditionError` where the noise as stated allows no gains, or none with which errors decay.
 
-    Gains are formed where some equation or output has no noise; where all have, the conditions of existence decide.
-    Of a plant of many states that decays by itself, with noise in every output, the filter has a steady state.
+    Gains are formed where some equation or output has no noise; where all have, the conditions of existence decide, and
+    so they do of a plant of many states whose errors decay for sure.
     """
     options = method.as_given()
     if shared_noise(plant, Q=options["Q"], R=options["R"]) is None:
         options = with_stated_noise(plant, options)
         if all(options[name] is None or _is_definite(options[name]) for name in ("Q", "R")):
             return
-        if plant.nx > MOST_STATES_TO_FORM_GAINS and _decays_by_itself(plant, options):
+        if plant.nx > MOST_STATES_TO_FORM_GAINS and _errors_decay(plant, options):
             return
     synthesise(plant, method, progress=lambda _: None)
 
 
-def _decays_by_itself(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> bool:
-    """Whether the model of a filter without parameters or unknown inputs decays, with noise in every output: errors of
-    the filter then decay, whatever Q and the first covariance are."""
-    if "form" in options or options["early_constraints"] or not isinstance(plant, DescriptorSystem) or plant.nd:
+def _errors_decay(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> bool:
+    """Whether errors of the states decay wherever the conditions of existence hold, with noise in every output.
+
+    They do where no mode is known exactly at first, like 1/k at the slowest, whatever Q is (de Souza, Gevers and
+    Goodwin 1986, theorem 4.2); or where the plant decays by itself, without unknown inputs.
+    """
+    if options["early_constraints"] or not isinstance(plant, DescriptorSystem) or not decide_rank(plant.E).full:
         return False
-    if (options["R"] is not None and not _is_definite(options["R"])) or not decide_rank(plant.E).full:
+    if options["R"] is not None and not _is_definite(options["R"]):
         return False
-    return spectral_radius(np.asarray(np.linalg.solve(plant.E, plant.A), dtype=np.float64)) < CLEARLY_STABLE
+    if options["initial_covariance"] is None or _is_definite(options["initial_covariance"]):
+        return True
+    motion = np.asarray(np.linalg.solve(plant.E, plant.A), dtype=np.float64)
+    return not plant.nd and spectral_radius(motion) < CLEARLY_STABLE
 
 
 def _is_definite(covariance: Any) -> bool:
