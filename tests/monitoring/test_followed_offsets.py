@@ -9,24 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from pumped_tank import DT, pumped
 
 import obsynth
 
-DT, ROWS, NOISE, AT = 0.1, 1_500, 0.1, 700
+ROWS, NOISE, AT = 1_500, 0.1, 700
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
-
-
-@functools.cache
-def design() -> obsynth.ObserverDesign:
-    """Return a tank whose pump loses a share of its flow."""
-    model = obsynth.DAEModel(
-        {"tank": "der(h) = 10 * (1 - f) * u - h"}, {"y": "h"}, states={"h": 0.0}, inputs={"u": 0.0},
-        parameters={"f": 0.0},
-    )  # fmt: skip
-    return obsynth.dae_adaptive_observer(
-        model, dt=DT, Q=[[1e-4]], R=[[0.01]], form="augmented-kalman", random_walk=[[1e-4]],
-        initial_covariance=[[0.01]], initial_parameter_covariance=[[0.01]],
-    )  # fmt: skip
 
 
 def log(seed: int, *, rows: int = ROWS, offset: str = "", size: float = 0.0, fault: float = 0.0) -> pd.DataFrame:
@@ -42,13 +30,13 @@ def log(seed: int, *, rows: int = ROWS, offset: str = "", size: float = 0.0, fau
 
 @functools.cache
 def learned() -> obsynth.types.LearnedThresholds:
-    return obsynth.learn_thresholds(design(), log(0), false_alarms="1 per 500 rows")
+    return obsynth.learn_thresholds(pumped(), log(0), false_alarms="1 per 500 rows")
 
 
 def alarms(data: pd.DataFrame, memory: float) -> np.ndarray:
     """Return which rows are in alarm where offsets are followed over so many rows."""
-    monitor = obsynth.online_monitor(design(), "learned", normal=replace(learned(), memory=memory))
-    return obsynth.run_on_data(design(), data, monitor=monitor).table["alarm"].ne("").to_numpy()
+    monitor = obsynth.online_monitor(pumped(), "learned", normal=replace(learned(), memory=memory))
+    return obsynth.run_on_data(pumped(), data, monitor=monitor).table["alarm"].ne("").to_numpy()
 
 
 @pytest.mark.long
@@ -82,7 +70,7 @@ def test_one_wrong_sample_moves_what_is_followed_no_more_than_noise_does() -> No
 
 @pytest.mark.long
 def test_several_logs_show_drifts_themselves_and_nothing_is_followed(tmp_path: Path) -> None:
-    several = obsynth.learn_thresholds(design(), [log(k, rows=600) for k in range(3)], false_alarms="1 per 500 rows")
+    several = obsynth.learn_thresholds(pumped(), [log(k, rows=600) for k in range(3)], false_alarms="1 per 500 rows")
     assert several.memory == 0.0
     assert "followed" not in several.statement
     assert "are followed and alarm nothing" in learned().statement

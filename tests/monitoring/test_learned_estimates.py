@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from pumped_tank import DT, pumped
 from scipy.signal import lfilter
 
 import obsynth
@@ -38,22 +39,8 @@ from obsynth.monitoring.thresholds.parameter_scores import (
 from obsynth.monitoring.verbs.data_arguments import summary_of_run
 from obsynth.numerics.autoregression import fitted_autoregression
 
-DT = 0.1
 SCORED = ("score", "information", "theta", "deviations")
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
-
-
-@functools.cache
-def pumped() -> obsynth.ObserverDesign:
-    """Return a tank whose pump loses a share of its flow."""
-    model = obsynth.DAEModel(
-        {"tank": "der(h) = 10 * (1 - f) * u - h"}, {"y": "h"}, states={"h": 0.0}, inputs={"u": 0.0},
-        parameters={"f": 0.0},
-    )  # fmt: skip
-    return obsynth.dae_adaptive_observer(
-        model, dt=DT, Q=[[1e-4]], R=[[0.01]], form="augmented-kalman", random_walk=[[1e-4]],
-        initial_covariance=[[0.01]], initial_parameter_covariance=[[0.01]],
-    )  # fmt: skip
 
 
 def log(rows: int, seed: int, *, begin: int | None = None, size: float = 0.3) -> pd.DataFrame:

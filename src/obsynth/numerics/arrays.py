@@ -78,6 +78,11 @@ def largest_singular_value(matrix: NDArray[Any]) -> float:
     return float(np.linalg.svd(matrix, compute_uv=False)[0]) if matrix.size else 0.0
 
 
+def sums_of_column_norms(matrices: NDArray[Any]) -> FloatArray:
+    """Return the sum of the norms of the columns of each of matrices ``(..., m, n)``."""
+    return np.asarray(np.linalg.norm(matrices, axis=-2).sum(axis=-1))
+
+
 def all_finite(vector: FloatArray) -> bool:
     """Whether every entry of a short vector ``(n,)`` is finite; what is not is left in a sum of them."""
     return math.isfinite(sum(vector.tolist())) or bool(np.isfinite(vector).all())

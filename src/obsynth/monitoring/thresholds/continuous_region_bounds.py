@@ -17,14 +17,13 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import error_model
 from obsynth.monitoring.thresholds.euler_bounds import EulerErrorBound, PlantMotion
 from obsynth.monitoring.thresholds.euler_rule import EulerRule, ResidualBound
-from obsynth.numerics.arguments import real_number
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.monitoring.thresholds.residual_monitor import with_stated_bounds
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, sums_of_column_norms
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.noise import require_noise
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.signal_names import index_of
 from obsynth.proofs.vertex_inequalities import Witness, prove_decay
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_polytope import ErrorPolytope
@@ -101,7 +100,8 @@ def continuous_region_bound(
     made = []
     for P, decay in _proved(design, models, inputs):
         root = np.asarray(np.linalg.cholesky(P).T)
-        driven = float(np.max(_columns(root @ inputs.flowing) + _columns(root @ inputs.reading), initial=0.0))
+        each = sums_of_column_norms(root @ inputs.flowing) + sums_of_column_norms(root @ inputs.reading)
+        driven = float(np.max(each, initial=0.0))
         gain = largest_singular_value(np.linalg.solve(root.T, inputs.C.T))
         start = None if initial_error is None else initial_error * largest_singular_value(root)
         errors = EulerErrorBound(motion, tracking, root, decay, driven * OUTWARD)
@@ -113,7 +113,7 @@ def continuous_region_bound(
             path="kind",
         )
     made = sorted(made, key=lambda each: each.gain * each.errors.driven / each.errors.decay)[:MOST_FOLLOWED]
-    direct = float(_columns(inputs.D[None])[0])
+    direct = float(sums_of_column_norms(inputs.D))
     best = made[0].errors
     rows = np.linalg.norm(np.linalg.solve(best.root.T, models[0].output(observer.fault_rows)[0].T), axis=0)
     scales = rows * best.driven / best.decay
@@ -129,12 +129,7 @@ def continuous_region_bound(
 
 
 def _stated_bounds(plant: PolytopicSystem, stated: Mapping[str, float] | None) -> FloatArray:
-    bounds = np.full(plant.nd, np.inf)
-    for name, value in (stated or {}).items():
-        place = index_of(name, plant.disturbance_names, what="disturbance_bounds")
-        bounds[place] = real_number(
-            value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"
-        )
+    bounds = with_stated_bounds(np.full(plant.nd, np.inf), plant.disturbance_names, stated)
     reached = np.any([v.Bd.any(axis=0) | v.Dd.any(axis=0) for v in plant.vertices], axis=0)
     lacking = [plant.disturbance_names[place] for place in np.flatnonzero(reached & ~np.isfinite(bounds))]
     if lacking:
@@ -260,8 +255,3 @@ def _ellipsoids(A: FloatArray, inputs: FloatArray) -> list[FloatArray]:
             except np.linalg.LinAlgError:
                 continue
     return made
-
-
-def _columns(matrices: FloatArray) -> FloatArray:
-    """Return the sum of the norms of the columns of each of matrices ``(N, m, n)``."""
-    return np.asarray(np.linalg.norm(matrices, axis=1).sum(axis=1))

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, sums_of_column_norms
 from obsynth.verification.over_tolerances.responses import OUTWARD
 
 #: Exponents below which ``e^x - 1 - x - x^2 / 2`` is taken as the first term of its series and a bound of the others:
@@ -135,7 +135,7 @@ class EulerErrorBound:
     @cached_property
     def _slope_of_noise(self) -> float:
         parts = np.concatenate([self.motion.A @ self.motion.by_noise, self.motion.Bd], axis=2)
-        return float(np.max(_columns(parts / self.motion.units[:, None]), initial=0.0))
+        return float(np.max(sums_of_column_norms(parts / self.motion.units[:, None]), initial=0.0))
 
     @cached_property
     def _slope_of_inputs(self) -> FloatArray:
@@ -151,7 +151,7 @@ class EulerErrorBound:
 
     @cached_property
     def _turned_noise(self) -> FloatArray:
-        return _columns(self._drive @ self._A_turns @ self.motion.by_noise)
+        return sums_of_column_norms(self._drive @ self._A_turns @ self.motion.by_noise)
 
 
 def _third_order(growth: float, seconds: float) -> float:
@@ -172,8 +172,3 @@ def _norms(rows: FloatArray) -> FloatArray:
 def _largest(matrices: FloatArray) -> float:
     """Return the largest spectral norm of matrices ``(N, m, n)``."""
     return float(np.max(np.linalg.norm(matrices, 2, axis=(1, 2)))) if matrices.size else 0.0
-
-
-def _columns(matrices: FloatArray) -> FloatArray:
-    """Return the sum of the norms of the columns of each of matrices ``(N, m, n)``."""
-    return np.asarray(np.linalg.norm(matrices, axis=1).sum(axis=1))

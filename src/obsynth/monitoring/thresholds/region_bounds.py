@@ -37,7 +37,7 @@ from obsynth.monitoring.thresholds.residual_norm_bounds import (
     UnlimitedHorizonBound,
     scaled_inputs,
 )
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, sums_of_column_norms
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.proofs.vertex_inequalities import pairs_of, prove_decay
 from obsynth.results.design import ObserverDesign
@@ -179,7 +179,8 @@ def _bound(
     inverse = np.asarray(np.linalg.inv(root))
     own, depth = _in_coordinates(errors, root, inverse), _depth(*errors.M.shape[:2])
     start, first = _start(errors, root, initial_error)
-    residual = _Courses(own.C, own.D, np.full(len(own.C), 0.0 if errors.first is None else _columns(errors.first.F)))
+    at_first = 0.0 if errors.first is None else float(sums_of_column_norms(errors.first.F))
+    residual = _Courses(own.C, own.D, np.full(len(own.C), at_first))
     error = _Courses(np.eye(len(root))[None], np.zeros((1, *own.B.shape[1:])), np.zeros(1))
     table, shrunk, reached = first, list[float](), list[float]()
     for step in range(depth + 1):
@@ -193,7 +194,7 @@ def _bound(
     share, since = shrunk[-1], reached[-1]
     if len(P) == 1:
         share = min(share, decay**depth)
-        each = max(map(_columns, own.B)) + max(map(_columns, own.K))
+        each = float(np.max(sums_of_column_norms(own.B)) + np.max(sums_of_column_norms(own.K)))
         since = min(since, each * (1.0 - decay**depth) / (1.0 - decay))
     settled = since / (1.0 - share) if share < 1.0 else np.inf
     if not np.isfinite(settled):
@@ -222,8 +223,9 @@ def _start(errors: ErrorsAtVertices, root: FloatArray, initial_error: float | No
     first = errors.first
     if first is None:
         return initial_error * float(np.linalg.norm(root, 2)), []
-    size = initial_error * float(np.linalg.norm(root @ first.start, 2)) + _columns(root @ first.start_inputs)
-    return size, [initial_error * float(np.linalg.norm(first.C, 2)) + _columns(first.F)]
+    by_inputs = float(sums_of_column_norms(root @ first.start_inputs))
+    size = initial_error * float(np.linalg.norm(root @ first.start, 2)) + by_inputs
+    return size, [initial_error * float(np.linalg.norm(first.C, 2)) + float(sums_of_column_norms(first.F))]
 
 
 class _Courses(NamedTuple):
@@ -236,18 +238,13 @@ class _Courses(NamedTuple):
     def one_earlier(self, errors: ErrorsAtVertices) -> _Courses:
         """Return the courses that begin a sample earlier, at every vertex."""
         corrections = errors.K if len(errors.K) == len(errors.M) else [errors.K[0]] * len(errors.M)
-        sums = [self.sums + _sums_of_columns(self.pending + self.products @ k) for k in corrections]
+        sums = [self.sums + sums_of_column_norms(self.pending + self.products @ k) for k in corrections]
         pending, products = ([self.products @ each for each in part] for part in (errors.B, errors.M))
         return _Courses(np.concatenate(products), np.concatenate(pending), np.concatenate(sums))
 
     def largest(self, size: float) -> float:
         """Return the largest output after an error of a size before the courses."""
-        return float(np.max(self.sums + _sums_of_columns(self.pending) + _norms(self.products) * size))
-
-
-def _sums_of_columns(matrices: FloatArray) -> FloatArray:
-    """Return the sums of the norms of the columns of matrices ``(K, m, n)``."""
-    return np.asarray(np.linalg.norm(matrices, axis=1).sum(axis=1))
+        return float(np.max(self.sums + sums_of_column_norms(self.pending) + _norms(self.products) * size))
 
 
 def _norms(matrices: FloatArray) -> FloatArray:
@@ -261,8 +258,3 @@ def _depth(vertices: int, order: int) -> int:
     if vertices == 1:
         return MOST_SAMPLES
     return max((depth for depth in range(1, MOST_SAMPLES) if vertices**depth <= courses), default=1)
-
-
-def _columns(matrix: FloatArray) -> float:
-    """Return the sum of the norms of columns."""
-    return float(np.sum(np.linalg.norm(matrix, axis=0)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -275,9 +275,14 @@ def _norm_threshold(kind: str, inputs: _ResidualInputs, gamma: float | None, win
 
 def bounds_of(design: ObserverDesign, model: ResidualModel, stated: Mapping[str, float] | None) -> FloatArray:
     """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given."""
-    bounds = model.bounds.copy()
+    return with_stated_bounds(model.bounds, design.linear[0].disturbance_names, stated)
+
+
+def with_stated_bounds(bounds: FloatArray, names: Sequence[str], stated: Mapping[str, float] | None) -> FloatArray:
+    """Return bounds of disturbances ``(nd,)`` with those that are stated by name in their places."""
+    bounds = bounds.copy()
     for name, value in (stated or {}).items():
-        place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
+        place = index_of(name, names, what="disturbance_bounds")
         bounds[place] = real_number(
             value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"
         )

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.residual_model import ContinuousDesign, ResidualModel, schur_form
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, sums_of_column_norms
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, state_units
@@ -144,7 +144,7 @@ def _remainder_of_powers(model: ResidualModel, powers: list[FloatArray], columns
 
 def _columns(matrix: FloatArray) -> float:
     """Return the sum of the norms of columns."""
-    return float(np.sum(np.linalg.norm(matrix, axis=0)))
+    return float(sums_of_column_norms(matrix))
 
 
 def _stacked_norms(responses: list[FloatArray], window: int) -> FloatArray:

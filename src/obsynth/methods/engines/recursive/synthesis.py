@@ -79,7 +79,7 @@ def _errors_decay(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options
     """Whether errors of the states decay wherever the conditions of existence hold, with noise in every output.
 
     They do where no mode is known exactly at first, like 1/k at the slowest, whatever Q is (de Souza, Gevers and
-    Goodwin 1986, theorem 4.2); or where the plant decays by itself, without unknown inputs.
+    Goodwin 1986); or where the plant decays by itself, without unknown inputs.
     """
     if options["early_constraints"] or not isinstance(plant, DescriptorSystem) or not decide_rank(plant.E).full:
         return False
