@@ -129,3 +129,14 @@ def test_a_continuous_plant_is_no_plant_without_an_observer() -> None:
     assert "No observer of this kind exists" not in text
     assert "'discrete time' fails" in text
     assert obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.1)) is not None
+
+
+def test_an_option_without_which_the_design_exists_is_the_remedy():
+    plant = obsynth.DescriptorSystem(A=[[0.5, 1.0], [0.0, 0.9]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError, match=r"It exists with delay 'auto' in place of 0\.$"):
+        obsynth.optimal_filter(plant, delay=0)
+    assert obsynth.optimal_filter(plant, delay="auto").report.passed
+    disturbed = obsynth.DescriptorSystem(A=plant.A, C=plant.C, Bf=plant.Bf, Bd=[[1.0], [0.0]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError, match=r"It exists without decoupled\.$"):
+        obsynth.optimal_filter(disturbed, decoupled=["d1"])
+    assert obsynth.optimal_filter(disturbed).report.passed

@@ -8,7 +8,7 @@ u the unit roundoff, in any units; the observer's own numbers, with z its state,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -16,8 +16,8 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import Condition, without_opening
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
-from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.method import Method
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.methods.method import Method, plain
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.spectra import pole_text
@@ -94,7 +94,7 @@ def with_advice(
     ``sensors``: those to try, by default one for each state; ``notes``: what was done to the plant before."""
     from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 
-    def holds(plant: DescriptorSystem) -> bool:
+    def holds(plant: DescriptorSystem, method: Method = method) -> bool:
         # What would help is a suggestion, not proved: the tried plant is decided exactly then.
         try:
             return all(condition.holds for condition in method.for_plant(plant).existence(plant, exactly=False))
@@ -117,9 +117,12 @@ def with_advice(
     if not plant.nf and error.condition == "faults":
         # No sensor makes a fault of none.
         return error
+    without = [_without(name, method) for name, other in _at_default(method) if holds(plant, other)]
     candidates = _as_noisy_as_others(plant, state_sensors(plant)) if sensors is None else sensors
-    sets = least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
-    if sets:
+    sets = () if without else least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
+    if without:
+        text = f"It exists {', and '.join(without)}."
+    elif sets:
         text = f"Measure one of: {listed_sets(sets)}."
     elif drops := _drops(plant, holds):
         text = f"Leave out one of: {', '.join(drops)}."
@@ -135,6 +138,24 @@ def with_advice(
         add=sets,
         unclear=error.unclear,
     )
+
+
+def _at_default(method: Method) -> Iterator[tuple[str, Method]]:
+    """Yield the method with one of its options at its default, for each option that a caller has changed."""
+    for option in fields(method):
+        if option.default is MISSING or np.array_equal(getattr(method, option.name), option.default):
+            continue
+        try:
+            yield option.name, replace(method, **{option.name: option.default})
+        except SpecError:
+            # The other options need it.
+            continue
+
+
+def _without(name: str, method: Method) -> str:
+    default = next(option.default for option in fields(method) if option.name == name)
+    given = "" if default is None else f" in place of {plain(getattr(method, name))!r}"
+    return f"without {name}" if default is None else f"with {name} {default!r}{given}"
 
 
 def _as_noisy_as_others(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> Sequence[Sensor]:
