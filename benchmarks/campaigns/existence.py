@@ -22,7 +22,7 @@ from benchmarks.campaigns.frame import Outcome
 from flint import fmpq, fmpq_mat
 
 import obsynth as ob
-from obsynth.methods.refusals import rounding_shares
+from obsynth.methods.rounding import rounding_shares
 
 CASES = 12000
 LIMIT = 120.0  # s

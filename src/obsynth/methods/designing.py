@@ -15,9 +15,10 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.analysis.existence.turning_filter import TURNING_CONDITION
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
-from obsynth.methods.refusals import require_above_rounding, with_advice
+from obsynth.methods.refusals import with_advice
 from obsynth.methods.region_trials import region_condition
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
+from obsynth.methods.rounding import require_above_rounding
 from obsynth.methods.verifying import verify
 from obsynth.methods.working_plants import working_plant
 from obsynth.numerics.arguments import arguments_checked, field_types

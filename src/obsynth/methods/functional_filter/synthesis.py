@@ -36,7 +36,8 @@ from obsynth.methods.functional_filter.parity_relation import SAMPLES, is_large,
 from obsynth.methods.functional_filter.rates import MOST_LONGER, default_rates, settling_time
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
-from obsynth.methods.refusals import require_above_rounding, require_all_conditions
+from obsynth.methods.refusals import require_all_conditions
+from obsynth.methods.rounding import require_above_rounding
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.ranks import rounding_rank
