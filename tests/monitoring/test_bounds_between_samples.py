@@ -327,3 +327,27 @@ def test_a_sampled_design_knows_what_moves_between_its_samples(direct: float, tm
     held = design.replace(source=None)
     assert obsynth.monitor(held, scenario).threshold[-1] < watched.threshold[-1]
     assert "held between samples" in obsynth.monitor(held, scenario).statement
+
+
+@pytest.mark.parametrize("kind", ["held", "line"])
+def test_known_inputs_that_move_between_samples_are_in_the_threshold(kind: str):
+    """A continuous design knows its inputs at samples only; its threshold follows what they may do between them."""
+    a, b, h, rows = np.array([[0.0, 4.0], [-4.0, -0.4]]), np.array([[0.0], [3.0]]), 0.2, 150
+    plant = obsynth.DescriptorSystem(
+        None, a, B=b, C=[[1.0, 0.0]], Bf=[[0.0], [1.0]], Bd=[[0.0], [0.01]], disturbance_names=["load"]
+    )
+    design = obsynth.pd_observer(plant, decay=1.0)
+    watched = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0}, sample_time=h)
+    u = np.random.default_rng(1).uniform(-1.0, 1.0, rows)
+    slopes = np.diff(u, append=u[-1]) / h if kind == "line" else np.zeros(rows)
+    step = expm(np.block([[a, b, np.zeros((2, 1))], [np.zeros((2, 3)), np.array([[1.0], [0.0]])]]) * h)
+    states = [np.zeros(2)]
+    for k in range(rows - 1):
+        states.append(step[:2, :2] @ states[-1] + step[:2, 2] * u[k] + step[:2, 3] * slopes[k])
+    log = {"time": h * np.arange(rows), "y1": np.array(states)[:, 0], "u1": u}
+    table = obsynth.run_on_data(design, log, monitor=watched).table
+    ratio = (table["statistic"] / table["threshold"]).dropna()
+    assert len(ratio) > 100
+    assert 0.9 < ratio.max() <= 1.0
+    # Disturbances alone are far from it.
+    assert table["statistic"].max() > 5.0 * watched.rule.limit

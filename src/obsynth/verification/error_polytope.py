@@ -10,7 +10,7 @@ product :math:`L(\mu) C(\mu)` would be of second degree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -179,9 +179,10 @@ class ErrorPolytope:
     def at(self, weights: FloatArray, gains: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
         """Return the closed M, B, Cz and Dz at weights, in floating point."""
         each = list(gains) * (self.count if len(gains) == 1 else 1)
-        mean: Callable[[Sequence[FloatArray]], FloatArray] = lambda X: sum(  # noqa: E731
-            (w * x for w, x in zip(weights, X, strict=True)), 0.0 * X[0]
-        )
+
+        def mean(matrices: Sequence[FloatArray]) -> FloatArray:
+            return np.asarray(sum(w * matrix for w, matrix in zip(weights, matrices, strict=True)))
+
         A = mean([a - g @ c for a, g, c in zip(self.A, each, self.C, strict=True)])
         B = mean([b - g @ d for b, g, d in zip(self.B, each, self.D, strict=True)])
         return A, B, mean(self.Cz), mean(self.Dz)
