@@ -8,7 +8,8 @@ import pytest
 from scipy.linalg import block_diag
 
 import obsynth
-from obsynth.verification.invisible_faults import Setting, proved_least, seen_plant
+from obsynth.verification.invisible_faults import proved_least
+from obsynth.verification.seen_outputs import Setting, seen_plant
 
 #: y1 = f_k + w_{k+1} and y2 = w_k + n_k: with one sample of delay w is measured, with noise.
 LATER_NOISE = obsynth.DescriptorSystem(

@@ -7,7 +7,8 @@ import pytest
 from benchmarks.campaigns import optimal_filters
 
 import obsynth
-from obsynth.verification.invisible_faults import Setting, proved_least, with_independent_outputs
+from obsynth.verification.invisible_faults import proved_least
+from obsynth.verification.seen_outputs import Setting, with_independent_outputs
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def test_the_noise_that_is_offered_closes_the_gap() -> None:
 @pytest.mark.parametrize(("case", "bound"), [(TWICE, 2 / 5**0.5), (HALF.replace(dt=0.0), 0.2**0.5)])
 def test_what_passes_at_once_bounds_every_filter(case, bound) -> None:
     from obsynth.verification.invisible_at_infinity import proved_at_infinity
-    from obsynth.verification.invisible_faults import Setting
+    from obsynth.verification.seen_outputs import Setting
 
     found = proved_at_infinity(case, Setting((), (ONE_FAULT,), False))
     assert bound * (1 - 1e-14) <= found <= bound
@@ -222,7 +222,7 @@ def test_what_passes_at_once_bounds_every_filter(case, bound) -> None:
 def test_what_passes_at_once_bounds_exact_filters() -> None:
     """Two outputs show a fault each, which noise hides by sqrt(5) and 3; an unknown input moves a third one alone."""
     from obsynth.verification.invisible_at_infinity import proved_at_infinity
-    from obsynth.verification.invisible_faults import Setting
+    from obsynth.verification.seen_outputs import Setting
 
     case = plant(
         A=[[-1.0]], Bf=[[1, 1]], Bd=[[1]], Bw=[[1, 1, 1]], C=[[1], [1], [1]], Df=[[1, 0], [0, 1], [0, 0]],
@@ -708,7 +708,8 @@ def test_a_bound_at_infinite_frequency_is_proved_again_or_not() -> None:
 
 def test_points_that_are_moved_give_no_false_bound(good) -> None:
     """Whatever the points are, what they prove is true: none of it is above the gain."""
-    from obsynth.verification.invisible_faults import Setting, proved_least, seen_plant
+    from obsynth.verification.invisible_faults import proved_least
+    from obsynth.verification.seen_outputs import Setting, seen_plant
 
     rng = np.random.default_rng(2)
     points = [complex(*pair) for pair in good.certificate.matrices["invisible"]]

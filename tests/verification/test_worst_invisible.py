@@ -8,7 +8,8 @@ import pytest
 
 import obsynth
 from obsynth.verification import invisible_faults
-from obsynth.verification.invisible_faults import PRECISION_BITS, Setting, proved_least, proved_limit, seen_plant
+from obsynth.verification.invisible_faults import PRECISION_BITS, proved_least, proved_limit
+from obsynth.verification.seen_outputs import Setting, seen_plant
 
 LAG = (np.array([[-2.0]]), np.array([[2.0]]), np.array([[1.0]]), np.array([[0.0]]))
 #: What each problem is: sampling, settings, points that are invisible, and last samples.

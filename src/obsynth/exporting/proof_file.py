@@ -47,7 +47,7 @@ from obsynth.proofs.witnesses import (
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.invisible_faults import seen_plant
+from obsynth.verification.seen_outputs import seen_plant
 
 PROOF_FORMAT, PROOF_VERSION = "obsynth-proof", 1
 #: A claimed rate of decay is proved for all but this share of it, as `obsynth.verify` does.

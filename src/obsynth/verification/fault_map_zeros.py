@@ -26,6 +26,7 @@ from obsynth.numerics.ranks import BOUNDARY_NEIGHBOURHOOD, NEGLIGIBLE_INPUT, RAN
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
+from obsynth.proofs.complex_balls import complex_matrix
 
 #: A fault map vanishes at a zero where one of its own zeros is as near, relative to the zero: six digits that a user
 #: writes are enough.  What does not vanish is above ``1 / (1 + k)`` for k lags, however far out the zero is.
@@ -128,15 +129,10 @@ def _modelled(point: complex, model: Model) -> tuple[ComplexArray, ComplexArray]
     if not len(a):
         return d.astype(np.complex128), np.zeros(d.shape, dtype=np.complex128)
     with flint.ctx.workprec(PRECISION_BITS):
-        inner = _matrix(point * np.eye(len(a))) - _matrix(a)
-        once = inner.solve(_matrix(b))
-        value, slope = _matrix(c) * once + _matrix(d), _matrix(c) * inner.solve(once)
+        inner = complex_matrix(point * np.eye(len(a))) - complex_matrix(a)
+        once = inner.solve(complex_matrix(b))
+        value, slope = complex_matrix(c) * once + complex_matrix(d), complex_matrix(c) * inner.solve(once)
         return _numbers(value), -_numbers(slope)
-
-
-def _matrix(part: Any) -> Any:
-    rows, columns = np.shape(part)
-    return flint.acb_mat(rows, columns, np.ravel(np.asarray(part, dtype=np.complex128)).tolist())
 
 
 def _numbers(matrix: Any) -> ComplexArray:

@@ -8,21 +8,16 @@ Source: ours; compare A. Varga, *Solving Fault Diagnosis Problems*, 2017, sectio
 
 from __future__ import annotations
 
-from typing import Any
-
 import flint
 import numpy as np
 
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.verification.invisible_faults import (
-    PRECISION_BITS,
-    Setting,
-    exact_kernel,
-    has_index_one,
-    hidden_and_bounded,
-    without_dependent,
-    worst_ratio,
-)
+from obsynth.proofs.ball_kernels import exact_kernel
+from obsynth.proofs.complex_balls import complex_matrix, rows_of
+from obsynth.verification.energy_ratios import worst_ratio
+from obsynth.verification.invisible_faults import PRECISION_BITS
+from obsynth.verification.seen_outputs import Setting, hidden_and_bounded, without_dependent
+from obsynth.verification.signals_from_rest import has_index_one
 
 
 def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | None:
@@ -31,7 +26,7 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
     Parameters
     ----------
     plant : DescriptorSystem
-        As `obsynth.verification.invisible_faults.seen_plant` returns it, in continuous time.
+        As `obsynth.verification.seen_outputs.seen_plant` returns it, in continuous time.
     setting : Setting
         What the filter must do.
     """
@@ -47,24 +42,19 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
     ]
     with flint.ctx.workprec(PRECISION_BITS[0]):
         signals = exact_kernel(np.vstack(rows))
-        inputs, answered = _rows(signals, 2 * nx), None
+        inputs, answered = rows_of(signals, range(2 * nx, signals.nrows())), None
         if faint is not None:
             rows_shown = np.hstack([faint.C, np.zeros((len(faint.C), nx)), faint.Dh, faint.Dw])
-            shown = flint.acb_mat(len(rows_shown), rows_shown.shape[1], rows_shown.ravel().tolist()) * signals
+            shown = complex_matrix(rows_shown) * signals
             shown = shown * flint.acb(faint.answer_limit)
             answered = shown.transpose() * shown
         first = 0 if setting.exact else bh.shape[1]
-        faults = _rows(inputs, first, first + plant.nf)
-        noise = _rows(inputs, bh.shape[1])
+        faults = rows_of(inputs, range(first, first + plant.nf))
+        noise = rows_of(inputs, range(bh.shape[1], inputs.nrows()))
         error = faults
         for *_, direct in setting.models:
-            error = flint.acb_mat(len(direct), direct.shape[1], direct.ravel().tolist()) * error
+            error = complex_matrix(direct) * error
         try:
             return worst_ratio(error.transpose() * error, noise.transpose() * noise, None, answered=answered)
         except ZeroDivisionError:  # a matrix is singular to these digits
             return None
-
-
-def _rows(matrix: Any, begin: int, end: int | None = None) -> Any:
-    table = matrix.tolist()[begin:end]
-    return flint.acb_mat(len(table), matrix.ncols(), [entry for row in table for entry in row])

@@ -65,7 +65,7 @@ def problem_of_options(plant: DescriptorSystem, options: dict[str, Any]) -> tupl
     from obsynth.methods.optimal_filter.method import OptimalFilterMethod
     from obsynth.methods.refusals import require_all_conditions
     from obsynth.numerics.least_estimation import whitened
-    from obsynth.verification.invisible_faults import seen_plant
+    from obsynth.verification.seen_outputs import seen_plant
 
     method = OptimalFilterMethod.of(options)
     existence = conditions(plant, method)

@@ -24,14 +24,8 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
-from obsynth.verification.invisible_faults import (
-    Setting,
-    nearly_dependent_outputs,
-    proved_least,
-    proved_limit,
-    with_independent_outputs,
-    with_outputs,
-)
+from obsynth.verification.invisible_faults import proved_least, proved_limit
+from obsynth.verification.seen_outputs import Setting, nearly_dependent_outputs, with_independent_outputs, with_outputs
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)

@@ -34,14 +34,9 @@ from obsynth.verification.fault_map_zeros import VANISHING_SHARE, missed_zeros
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import proof_row, prove_norm, stability_row
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
-from obsynth.verification.invisible_faults import (
-    LONGEST_DELAY,
-    Setting,
-    proved_least,
-    proved_limit,
-    seen_plant,
-)
+from obsynth.verification.invisible_faults import LONGEST_DELAY, proved_least, proved_limit
 from obsynth.verification.plant import plant_information
+from obsynth.verification.seen_outputs import Setting, seen_plant
 
 #: Faults pass by the fault map to this share of its largest entry.
 FAULT_MAP_SHARE = 1e-6

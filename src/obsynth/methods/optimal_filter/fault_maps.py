@@ -33,7 +33,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of, structure_of, without_hidden
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.fault_map_zeros import require_vanishing
-from obsynth.verification.invisible_faults import Setting, seen_plant
+from obsynth.verification.seen_outputs import Setting, seen_plant
 from obsynth.verification.weighted_plant import weighted_plant
 
 #: A gain below this share of what the faults do to the error without a filter is zero but for rounding.

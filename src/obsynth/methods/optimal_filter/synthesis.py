@@ -51,7 +51,8 @@ from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import stability_factor
-from obsynth.verification.invisible_faults import has_index_one, seen_plant
+from obsynth.verification.seen_outputs import seen_plant
+from obsynth.verification.signals_from_rest import has_index_one
 
 #: A delay is taken when its least gain is at most this much above that of the longest one that was tried.
 DELAY_ROOM = 1.05
