@@ -31,7 +31,7 @@ _TYPE_NAMES = {
     "results.checks": "Check",
     "simulation.simulate": "Simulation",
     "simulation.trajectory": "Trajectory",
-    "studies.comparison": "ComparedMethod FaultComparison",
+    "studies.compared_methods": "ComparedMethod FaultComparison",
     "studies.evaluate": "Evaluation Interval",
     "studies.fleet": "Fleet FleetRun",
     "studies.region_trade_off": "RegionTradeOff",

@@ -29,8 +29,8 @@ from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.results.checks import Check as Check
 from obsynth.simulation.simulate import Simulation as Simulation
 from obsynth.simulation.trajectory import Trajectory as Trajectory
-from obsynth.studies.comparison import ComparedMethod as ComparedMethod
-from obsynth.studies.comparison import FaultComparison as FaultComparison
+from obsynth.studies.compared_methods import ComparedMethod as ComparedMethod
+from obsynth.studies.compared_methods import FaultComparison as FaultComparison
 from obsynth.studies.evaluate import Evaluation as Evaluation
 from obsynth.studies.evaluate import Interval as Interval
 from obsynth.studies.fleet import Fleet as Fleet

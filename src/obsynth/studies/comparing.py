@@ -41,17 +41,9 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import duration
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
+from obsynth.studies.compared_methods import ComparedMethod, FaultComparison
 from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
-from obsynth.studies.comparison import (
-    ComparedMethod,
-    Comparison,
-    FaultComparison,
-    comparison_statement,
-    delay_in_words,
-    relative_error,
-    rms,
-    short_delay,
-)
+from obsynth.studies.comparison import Comparison
 from obsynth.studies.equal_delays import (
     HEALTHY_TIME,
     delay_of_scenario,
@@ -60,6 +52,7 @@ from obsynth.studies.equal_delays import (
     normal_rows,
 )
 from obsynth.studies.least_thresholds import response_steps, thresholds_beside_least
+from obsynth.studies.ranking import comparison_statement, delay_in_words, relative_error, rms, short_delay
 
 #: Runs of the scenario, and samples and settling times where nothing is stated.
 RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000

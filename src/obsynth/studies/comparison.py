@@ -13,27 +13,23 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
-from obsynth.methods.fault_figures import FaultFigures
-from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.report.plots.panels import (
-    LINE_COLOURS,
-    TRUE_STYLE,
     data_url,
-    label_time,
-    legend_above,
-    tidy,
     with_unit,
     written,
 )
-from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
+from obsynth.results.certificate_files import result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
 from obsynth.results.layout import number, upper_number
+from obsynth.studies.compared_methods import ComparedMethod, FaultComparison
 from obsynth.studies.equal_delays import HEALTHY_TIME
+from obsynth.studies.plots.comparison import drawn_comparison
+from obsynth.studies.ranking import comparison_statement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,23 +38,8 @@ if TYPE_CHECKING:
 #: Samples of the window on which the least threshold is looked for, at most.
 LONGEST_WINDOW = 32
 
-#: How far a signal reaches is judged by this share of its samples.
-SHOWN_SAMPLES = 0.98
-
-#: Room below and above a fault in its panel, as a share of its range.
-ROOM_AROUND_FAULT = 0.1
-
-#: An estimate that reaches so many times as far as the fault and the best estimate has a panel of its own.
-NOISIER = 3.0
-
-#: Order in which truth is drawn among noise that would hide it.
-ON_TOP = 20.0
-
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
-
-#: Where nothing is known of delays on a log, a method comes last.
-NO_DELAYS = (float("inf"), float("inf"))
 
 #: The column that a log adds.
 EQUAL_DELAY = "delay at equal healthy time"
@@ -126,171 +107,6 @@ _OF_THE_EXACT_MODEL = (
     "Times, deviations, gains and the least of any causal filter are of the exact model, with faults and disturbances "
     "that are held between samples."
 )
-
-
-@dataclass(frozen=True)
-class FaultComparison:
-    """How one method estimates one fault.
-
-    Parameters
-    ----------
-    figures : FaultFigures
-        In closed form, on the nominal plant.
-    rms : float
-        Root mean square of ``fhat - f`` over the drawn runs of the scenario, not shifted by any delay.
-    size : float
-        Root mean square of the fault itself in these runs; where it does not happen, the largest `rms` of any method.
-    bias : float
-        Largest absolute mean over the runs of the estimate without a fault: what tolerances and disturbances make.
-    threshold : float
-        Level of an alarm, calibrated on the fault-free runs.
-    detection_delay : float, seconds
-        Median over the runs, from the start of the fault.
-    smallest_found : float
-        Size of a step that half of the runs find.
-    bound : float
-        What the estimate of the exact model never passes without a fault, with disturbances as large as in the scenario
-        that are held between samples, and three deviations of noise: sums of absolute values.
-    least : float
-        The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples of inputs and outputs
-        can have (fewer of plants with more than 78 states), linear or not: of a fault of any time course where the
-        estimate is one sample of it, else of a constant one.  An observer uses all samples before, and its bound may be
-        smaller.
-    equal_delay : float, seconds
-        On a log: from the fault to its alarm, with the level that 1 % of the normal rows pass; median over its begins,
-        infinite where it is not found.
-
-    Examples
-    --------
-    >>> import obsynth
-    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
-    >>> comparison = obsynth.compare(plant, methods=["functional-filter"], runs=2)
-    >>> fault = comparison.methods[0].faults[0]
-    >>> fault.figures.fault, fault.rms >= 0.0
-    ('f1', True)
-    """
-
-    figures: FaultFigures
-    rms: float
-    size: float
-    bias: float
-    threshold: float
-    detection_delay: float
-    smallest_found: float
-    bound: float = float("nan")
-    least: float = float("nan")
-    equal_delay: float = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class ComparedMethod:
-    """One method, or why there is none.
-
-    Parameters
-    ----------
-    method : str
-        Its id.
-    refused : str
-        Why it does not exist, in one line; empty where it does.
-    design : ObserverDesign or None
-        The design, verified.
-    order : int
-        States of the observer on the common clock.
-    milliseconds : float
-        To design and verify.
-    faults : tuple of FaultComparison
-        One for each fault.
-    fast_enough : bool
-        Whether 90 % of every step is shown within the time asked for.
-    responses : FloatArray
-        ``(steps, faults)``: estimates of a unit step of each fault.
-    estimates : FloatArray
-        ``(steps, faults)``: on the first drawn run, or on the log.
-    beside : LeastPossible or None
-        Gain from the unknown inputs, and deviation for the noise, with the least of any causal filter that responds to
-        the faults as this one does, in the design's own time; ``None`` where that is not known.
-
-    Examples
-    --------
-    >>> import obsynth
-    >>> plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
-    >>> comparison = obsynth.compare(plant, methods=["functional-filter"], runs=2)
-    >>> method = comparison.methods[0]
-    >>> method.method, method.refused, method.order
-    ('functional-filter', '', 2)
-    """
-
-    method: str
-    refused: str
-    design: ObserverDesign | None
-    order: int
-    milliseconds: float
-    faults: tuple[FaultComparison, ...]
-    fast_enough: bool
-    responses: FloatArray
-    estimates: FloatArray
-    beside: LeastPossible | None = None
-
-    @property
-    def shares(self) -> tuple[float, float]:
-        """Gain and deviation in times the least possible; NaN where that is not known."""
-        beside = self.beside
-        return (np.nan, np.nan) if beside is None else (beside.gain_share, beside.deviation_share)
-
-    @property
-    def relative_error(self) -> float:
-        """Root mean square over all faults of each one's error, as a share of its size: the same in all units."""
-        return relative_error([vars(fault) for fault in self.faults])
-
-    @property
-    def equal_delay(self) -> tuple[int, float] | None:
-        """How many faults raise no alarm, and the mean delay of the others (s), at equal healthy time in alarm on a
-        log; `None` without one."""
-        return mean_delay([fault.equal_delay for fault in self.faults])
-
-    @property
-    def label(self) -> str:
-        """What it is called in a picture: with its delay at equal healthy time in alarm, on a log."""
-        delay = self.equal_delay
-        if delay is None:
-            return self.method
-        return f"{self.method} ({f'{number(delay[1])} s' if np.isfinite(delay[1]) else 'no alarm'})"
-
-    @property
-    def ranked_by(self) -> tuple[float, ...]:
-        """What methods are ranked by, the least first."""
-        return (*(self.equal_delay or NO_DELAYS), self.relative_error)
-
-
-def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
-    """Return the root mean square of ``rms / size`` over faults; infinite where there are none."""
-    shares = [fault["rms"] / fault["size"] if fault["rms"] else 0.0 for fault in faults]
-    return rms(shares) if shares else float("inf")
-
-
-def mean_delay(delays: Sequence[float]) -> tuple[int, float] | None:
-    """Return how many delays are infinite, and the mean of the finite ones; `None` where there are none at all."""
-    known = [delay for delay in delays if not np.isnan(delay)]
-    finite = [delay for delay in known if np.isfinite(delay)]
-    if not known:
-        return None
-    return len(known) - len(finite), float(np.mean(finite)) if finite else float("inf")
-
-
-def delay_in_words(delay: tuple[int, float], healthy_time: float) -> str:
-    """Return what `ComparedMethod.equal_delay` is, in words."""
-    missing, mean = delay
-    words = "no fault raises an alarm" if np.isinf(mean) else f"alarms after {number(mean)} s"
-    words += f" with {100 * healthy_time:g} % of healthy time in alarm"
-    return f"{words} ({missing} without one)" if missing and np.isfinite(mean) else words
-
-
-def short_delay(delay: tuple[int, float]) -> str:
-    """Return the same in two or three words, for a list."""
-    missing, mean = delay
-    if np.isinf(mean):
-        return "no alarm"
-    return f"{number(mean)} s" + (f" ({missing} without one)" if missing else "")
 
 
 @fields_suggested
@@ -381,7 +197,8 @@ class Comparison:
         return (*figures[:-3], fault.equal_delay, *figures[-3:]) if self._has_delays else figures
 
     @property
-    def _units(self) -> dict[str, str]:
+    def units(self) -> dict[str, str]:
+        """The units of the signals, by their names."""
         return next((dict(entry.design.plant.units) for entry in self.methods if entry.design is not None), {})
 
     def meanings(self, columns: Sequence[str] | None = None) -> str:
@@ -503,75 +320,15 @@ class Comparison:
         return self._drawn(plt.figure)
 
     def _drawn(self, new_figure: Callable[..., Figure]) -> Figure:
-        drawn = [entry for entry in self.methods if entry.faults]
-        count = len(self.fault_names)
-        far = [self._far_noisier(drawn, row) for row in range(count)]
-        columns = 3 if any(far) else 2
-        figure = new_figure(figsize=(3.5 + 3.75 * (columns - 1), 2.8 * count), layout="constrained")
-        axes = figure.subplots(count, columns, squeeze=False)
-        figure.align_ylabels(axes)
-        for row, name in enumerate(self.fault_names):
-            left_panel, *panels = axes[row]
-            sets = ([entry for entry in drawn if entry not in far[row]], far[row])
-            for panel, entries in zip(panels, sets, strict=False):
-                if not entries:
-                    panel.set_visible(False)
-                    continue
-                over = {"zorder": ON_TOP} if entries is far[row] else {}
-                if np.isfinite(self.truth[:, row]).any():
-                    panel.plot(self.times, self.truth[:, row], label="fault", **over, **TRUE_STYLE)
-                panel.set_ylim(*self._range(entries, row))
-                panel.set_ylabel(with_unit(name, self._units))
-            left_panel.axhline(1.0, color="0.8", linewidth=0.8)
-            for rank, entry in enumerate(drawn):
-                names = [fault.figures.fault for fault in entry.faults]
-                if name not in names:
-                    continue
-                column, colour = names.index(name), LINE_COLOURS[rank % len(LINE_COLOURS)]
-                # The best lies on top.
-                style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(drawn) - rank}
-                response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
-                left_panel.plot(np.arange(len(response)) * self.sample_time, response, label=entry.label, **style)
-                noisy = entry in far[row]
-                label = {"label": f"{entry.method}, far noisier"} if noisy else {}
-                panels[int(noisy)].plot(self.times, estimate, **style, **label, linewidth=0.4 if noisy else 0.8)
-            times = [f.figures.most for entry in drawn for f in entry.faults if np.isfinite(f.figures.most)]
-            length = max((len(entry.responses) for entry in drawn), default=2) * self.sample_time
-            left_panel.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
-            left_panel.set_ylabel(f"estimate of a unit step\nof {name}")
-            for panel in (left_panel, *panels):
-                label_time(panel)
-                tidy(panel)
-            for panel in panels if row == 0 else panels[1:]:
-                if panel.get_visible() and panel.get_legend_handles_labels()[0]:
-                    legend_above(panel)
-        legend_above(axes[0, 0])
-        return figure
-
-    def _far_noisier(self, entries: Sequence[ComparedMethod], row: int) -> list[ComparedMethod]:
-        """Return the methods whose estimate of a fault would hide the others in one panel; the first is none."""
-        name, reaches = self.fault_names[row], list[tuple[ComparedMethod, float]]()
-        for entry in entries:
-            names = [fault.figures.fault for fault in entry.faults]
-            if name in names:
-                reaches.append((entry, _reach(entry.estimates[:, names.index(name)])))
-        if not reaches:
-            return []
-        most = NOISIER * max(_reach(self.truth[:, row]), reaches[0][1])
-        return [entry for entry, reach in reaches[1:] if reach > most]
-
-    def _range(self, entries: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
-        """Return the ends of the panel of a fault: all of the truth, and of every estimate."""
-        known = self.truth[np.isfinite(self.truth[:, row]), row]
-        low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
-        for entry in entries:
-            names = [fault.figures.fault for fault in entry.faults]
-            if self.fault_names[row] in names:
-                estimate = entry.estimates[:, names.index(self.fault_names[row])]
-                if np.isfinite(estimate).any():
-                    low, high = min(low, float(np.nanmin(estimate))), max(high, float(np.nanmax(estimate)))
-        room = ROOM_AROUND_FAULT * (high - low or 1.0)
-        return low - room, high + room
+        return drawn_comparison(
+            self.methods,
+            self.fault_names,
+            self.times,
+            self.truth,
+            sample_time=self.sample_time,
+            units=self.units,
+            new_figure=new_figure,
+        )
 
     def __repr__(self) -> str:
         table = text_table(self.rows(), left_aligned=2)
@@ -602,7 +359,7 @@ class Comparison:
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         head, *rows = self.rows()
         # With the unit of each fault, in which its figures are.
-        table = (head, *((method, with_unit(fault, self._units), *cells) for method, fault, *cells in rows))
+        table = (head, *((method, with_unit(fault, self.units), *cells) for method, fault, *cells in rows))
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
@@ -614,58 +371,6 @@ class Comparison:
             *(["<h2>Methods without a design</h2>", f"<ul>{refused}</ul>"] if refused else []),
         ]
         return standing_page("Comparison of methods", body, generator="obsynth compare")
-
-
-def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], log: Mapping[str, Any] | None) -> str:
-    """Return what the figures of a comparison come to; ``digests`` are those of the gain sets."""
-    methods = claims["methods"]
-    errors = {name: relative_error(entry["faults"]) for name, entry in methods.items()}
-    delays = {
-        name: mean_delay([float(fault.get("equal_delay", "nan")) for fault in entry["faults"]])
-        for name, entry in methods.items()
-    }
-    best = min(methods, key=lambda name: (not methods[name]["fast_enough"], *(delays[name] or NO_DELAYS), errors[name]))
-    if delays[best] is not None:
-        return _statement_on_log(claims, digests, log, best, delays)
-    other_errors = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
-    fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
-    where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
-    gain_sets = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
-    against = f" against {other_errors}" if other_errors else ""
-    return (
-        f"Of the methods that exist, {best} has the least rms error of the fault estimates, as a share of each fault's "
-        f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
-    )
-
-
-def _statement_on_log(
-    claims: Mapping[str, Any],
-    digests: Mapping[str, str],
-    log: Mapping[str, Any] | None,
-    best: str,
-    delays: Mapping[str, tuple[int, float] | None],
-) -> str:
-    """Return the sentence where methods are ranked by their delays at equal healthy time in alarm on a log."""
-    methods = claims["methods"]
-    own = delays[best]
-    words = "" if own is None else delay_in_words(own, HEALTHY_TIME)
-    others = ", ".join(
-        f"{short_delay(delay)} of {name}" for name, delay in delays.items() if name != best and delay is not None
-    )
-    fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
-    where = "" if log is None else f", on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
-    gain_sets = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
-    return (
-        f"Of the methods that exist, {best} comes first by the time that was asked for, the faults that raise no alarm "
-        f"and the mean delay of the others: {words}{f', against {others}' if others else ''}"
-        f"{fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
-    )
-
-
-def _reach(values: FloatArray) -> float:
-    """Return how far nearly all values of a signal reach from zero; 0 where none is known."""
-    known = np.abs(values[np.isfinite(values)])
-    return float(np.quantile(known, SHOWN_SAMPLES)) if known.size else 0.0
 
 
 def _figures(entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]:
@@ -692,10 +397,3 @@ def _figures(entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]
 
 def _number(value: float) -> str:
     return "-" if np.isnan(value) else "never" if np.isinf(value) else number(value, digits=3)
-
-
-def rms(errors: Sequence[float] | FloatArray) -> float:
-    """Return the root of the mean square; where a sample is missing (NaN) there is no error."""
-    values = np.asarray(errors, dtype=np.float64)
-    values = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
