@@ -249,3 +249,14 @@ def test_the_page_lists_meanings_and_refusals_and_names_units(bicycle: obsynth.C
         assert f"<li>{html.escape(refusal)}</li>" in page
         assert "..." not in refusal
     assert "<li>s to alarm: median detection delay</li>" in page
+
+
+def test_a_plant_that_settles_over_thousands_of_samples_needs_no_scenario():
+    """Every fault has its turn in the runs, however slow the plant is."""
+    plant = obsynth.DescriptorSystem(
+        A=np.diag([0.9995, 0.999]), C=np.eye(2), Bf=np.eye(2), dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1}
+    )
+    compared = obsynth.compare(plant, methods=["fault-estimation-filter"], runs=2)
+    (entry,) = compared.methods
+    assert np.all(np.any(compared.truth == 1.0, axis=0))
+    assert all(np.isfinite(fault.detection_delay) for fault in entry.faults)

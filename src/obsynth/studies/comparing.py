@@ -391,14 +391,15 @@ def _scenario(plant: DescriptorSystem, scenario: Scenario | None, dt: float, dis
         # All runs begin at rest; a state that is given may be one that the sampled plant does not have any more.
         return clocked.replace(observer_state=None, initial_state={}, stabilise=False)
     settle = max(settling_time(plant), 4.0 * dt)
-    length = SETTLING_TIMES * settle
+    # Each fault has its turn, if need be before everything has settled.
+    length = min(SETTLING_TIMES * settle, MOST_SCENARIO_SAMPLES * dt / max(plant.nf, 1))
     faults = {
         name: Step(size=1.0, start=(1.0 + 2.0 * i) * length / 2.0, end=(2.0 + 2.0 * i) * length / 2.0)
         for i, name in enumerate(plant.fault_names)
     }
     frequency = PERIOD_SHARE / settle
     return Scenario(
-        horizon=min(plant.nf * length, MOST_SCENARIO_SAMPLES * dt),
+        horizon=plant.nf * length,
         sample_time=None if plant.dt else dt,
         faults=faults,
         noise=1.0,
