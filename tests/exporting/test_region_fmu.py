@@ -12,7 +12,7 @@ import pytest
 from test_fmu_export import Stepped
 
 import obsynth
-from obsynth import ObserverDesign, PolytopicSystem, SpecError
+from obsynth import ObserverDesign, PolytopicSystem
 from obsynth.exporting.fmu import archive
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear import c_code
@@ -61,6 +61,7 @@ def _rows(design: ObserverDesign, count: int = 160) -> FloatArray:
 
 
 def _in_unit(design: ObserverDesign, folder: Path, rows: FloatArray, version: str, **options: Any) -> pd.DataFrame:
+    dt = options.get("sample_time", design.observer.dt)
     (path,) = obsynth.export(design, folder / "region.fmu", fmi=version, **options)
     assert fmpy.validation.validate_fmu(str(path)) == []
     observer, stepped = design.observer, Stepped(path, folder / "unpacked")
@@ -71,17 +72,18 @@ def _in_unit(design: ObserverDesign, folder: Path, rows: FloatArray, version: st
     found = []
     for k, row in enumerate(rows):
         stepped.set([stepped.references[name] for name in (*observer.input_names, *observer.output_names)], list(row))
-        stepped.unit.doStep(currentCommunicationPoint=k * observer.dt, communicationStepSize=observer.dt)
+        stepped.unit.doStep(currentCommunicationPoint=k * dt, communicationStepSize=dt)
         found.append([*stepped.values(shown), stepped.flag("alarm"), stepped.flag("sample_used")])
     stepped.end()
     return pd.DataFrame(found, columns=[*shown, "alarm", "sample_used"])
 
 
 def _on_a_log(
-    design: ObserverDesign, folder: Path, rows: FloatArray, names: Sequence[str] = (), **options: Any
+    design: ObserverDesign, folder: Path, rows: FloatArray, names: Sequence[str] = (), dt: float = 0.0, **options: Any
 ) -> pd.DataFrame:
+    dt = dt or design.observer.dt
     names = names or (*design.observer.input_names, *design.observer.output_names)
-    log = pd.DataFrame({"time": design.observer.dt * np.arange(len(rows)), **dict(zip(names, rows.T, strict=True))})
+    log = pd.DataFrame({"time": dt * np.arange(len(rows)), **dict(zip(names, rows.T, strict=True))})
     obsynth.run_on_data(design, log, out=folder / "run.csv", **options)
     return pd.read_csv(folder / "run.csv")
 
@@ -148,9 +150,21 @@ def test_a_unit_has_no_input_that_is_one_in_every_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_observer_in_continuous_time_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_observer_in_continuous_time_is_a_unit_of_its_sample_time(tmp_path: Path, version: str) -> None:
     plant = PolytopicSystem(
-        plant={"A": [["-1 - v", 1], [0, -2]], "Bf": [[0], [1]], "C": [[1, 0], [0, 1]]}, scheduling={"v": [0, 1]}
-    )
-    with pytest.raises(SpecError, match="continuous in time"):
-        obsynth.export(obsynth.ui_pi_observer(plant), tmp_path / "region.fmu")
+        plant={
+            "A": [["-1 - v", 1], [0.2, -2]], "B": [[1], [0.5]], "Bf": [[0], [1]], "Bd": [[1], [0]],
+            "C": [[1, 0], [0, 1]], "operating_point": {"u1": 2.0, "y1": 3.0, "x1": 3.0},
+        },
+        scheduling={"v": {"range": [0, 1], "rate": 30.0}},
+    )  # fmt: skip
+    design, levels = obsynth.ui_pi_observer(plant), {"fhat[f1]": 2.0}
+    rng = np.random.default_rng(2)
+    rows = np.column_stack([rng.standard_normal(160), rng.uniform(0.0, 1.0, 160), 3.0 * rng.standard_normal((160, 2))])
+    rows[0, 3], rows[60:63, 2], rows[80, 1], rows[130, 1] = np.nan, np.nan, np.nan, -2.0
+    unit = _in_unit(design, tmp_path, rows, version, sample_time=0.05, thresholds=levels, warm_up=0.2)
+    run = _on_a_log(design, tmp_path, rows, dt=0.05, thresholds=levels, warm_up=0.2)
+    _same(unit, run)
+    assert {"ok", "out", "gap", "warm-up"} <= set(run.status)
+    assert unit.alarm.any()

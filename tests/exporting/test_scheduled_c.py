@@ -222,8 +222,10 @@ def test_arrays_hold_the_observer_at_every_vertex(name: str, suffix: str, tmp_pa
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     design = obsynth.fault_estimation_filter(wang())
-    with pytest.raises(SpecError, match="leave sample_time and precision out"):
+    with pytest.raises(SpecError, match="sampled already"):
         obsynth.export(design, tmp_path / "region.fmu", sample_time=1.0)
+    with pytest.raises(SpecError, match="leave precision out"):
+        obsynth.export(design, tmp_path / "region.c", precision="float")
     with pytest.raises(SpecError, match="leave sample_time out"):
         obsynth.export(design, tmp_path / "region.mat", sample_time=1.0)
     with pytest.raises(SpecError, match="no output"):

@@ -109,9 +109,10 @@ def scheduled_alarms(
     warm_up: float | None,
     monitor: ExportedMonitor | None,
 ) -> Alarms:
-    """Return the alarms of a scheduled observer in discrete time."""
+    """Return the alarms of a scheduled observer."""
     columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
-    seconds = checked_warm_up(warm_up, observer.forgetting * observer.dt)
+    # Rows to forget in discrete time, seconds in continuous time.
+    seconds = checked_warm_up(warm_up, observer.forgetting * (observer.dt or 1.0))
     return Alarms.of(columns, observer.fault_names, thresholds, seconds, monitor)
 
 

@@ -1,7 +1,11 @@
-"""Scheduled observers as C99: means of the matrices at the vertices, no allocation, rows outside the region marked."""
+"""Scheduled observers as C99: means of the matrices at the vertices, no allocation, rows outside the region marked.
+
+Those in continuous time take from row to row the step of implicit Euler that a run on a log takes.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +24,7 @@ from obsynth.exporting.c_source import (
     signal_comments,
     table_lines,
 )
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import Expression, step_function
 from obsynth.observers.linear.modes import SETTLING_SLACK
@@ -64,8 +69,28 @@ _C_FUNCTIONS: dict[Callable[..., Any], str] = {
 }
 
 
-def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms) -> tuple[str, str]:
-    """Return source and header."""
+def seconds_between_rows(observer: ScheduledObserver, sample_time: float | None) -> float:
+    """Return the seconds between the samples of a file: those of the observer, or stated ones in continuous time."""
+    if observer.dt > 0.0:
+        if sample_time is not None:
+            raise SpecError(
+                f"The design is sampled already (dt = {observer.dt:g} s): leave the sample time out.",
+                path="sample_time",
+            )
+        return observer.dt
+    if sample_time is None:
+        raise SpecError(
+            "The observer is continuous in time: give the sample time (sample_time, --sample-time), in seconds, for C "
+            "and for an FMU.",
+            path="sample_time",
+        )
+    return real_number(sample_time, "sample_time", "seconds, above 0", above=0.0)
+
+
+def scheduled_c_texts(
+    design: ObserverDesign, prefix: str, header: str, alarms: Alarms, seconds: float
+) -> tuple[str, str]:
+    """Return source and header of an observer that takes a sample after so many seconds each."""
     plant, observer = design.scheduled
     nu, ny, digest = observer.inputs, len(observer.output_names), gain_set_digest(design)
     upper, mark = prefix.upper(), unverified_mark(design.report)
@@ -81,8 +106,8 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: 
         comment("sha256 of the gain set"),
         f'#define {upper}_SHA256 "{digest}"',
         comment("seconds between samples; rows without a claim after one outside the region"),
-        f"#define {upper}_DT {observer.dt!r}",
-        f"#define {upper}_FORGETTING {observer.forgetting}",
+        f"#define {upper}_DT {seconds!r}",
+        f"#define {upper}_FORGETTING {observer.rows_without_claim(seconds)}",
         comment("outputs that may be watched"),
         f"#define {upper}_WATCHED {len(alarms.levels)}",
         "",
@@ -95,10 +120,10 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: 
         comment("Read these after a step: what the row was, and which outputs passed their levels (if OK)."),
         *alarm_fields(alarms, prefix),
         comment("Everything else is the observer's own."),
-        f"    REAL z[{max(observer.order, 1)}], weights[{observer.count}];",
+        f"    REAL z[{max(observer.order, 1)}], weights[{observer.count}], unclaimed;",
         f"    REAL parameters[{len(observer.scheduling.names)}];",
         f"    REAL u[{max(nu, 1)}], y[{ny}];",
-        "    int unclaimed, settling, is_started, is_recovering;",
+        "    int settling, is_started, is_recovering;",
         f"}} {prefix}_state;",
         "",
         comment("Start at rest."),
@@ -115,11 +140,13 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: 
         "",
         "#endif",
     ]
-    return _source(design, prefix, header, digest, alarms), "\n".join(declared) + "\n"
+    return _source(design, prefix, header, digest, alarms, seconds), "\n".join(declared) + "\n"
 
 
-def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarms: Alarms) -> str:
+def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarms: Alarms, seconds: float) -> str:
     _, observer = design.scheduled
+    is_continuous = observer.dt == 0.0
+    recovering = math.ceil(observer.forgetting / seconds - SETTLING_SLACK) if is_continuous else observer.forgetting
     held, nu = observer.scheduling, observer.inputs
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     sizes = {
@@ -131,7 +158,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         "STATE_COUNT": nx,
         **({} if observer.correction is None else {"RESIDUAL_COUNT": nr}),
         "ROW_COUNT": nx + nf + nr,
-        "FORGETTING": observer.forgetting,
+        "RECOVERING_ROWS": int(min(recovering, MOST_ROWS)),
     }
     # These stand in conditions of the preprocessor too.
     defined = {
@@ -139,6 +166,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         "FAULT_COUNT": nf,
         "DIVIDES": int(not observer.effectiveness_is_one),
         "CORRECTS": int(observer.correction is not None),
+        "IS_CONTINUOUS": int(is_continuous),
         "MONITORS": int(alarms.monitor is not None),
         "WATCHED": len(alarms.levels),
         "GIVES_WEIGHTS": int(held.gives_weights),
@@ -165,13 +193,15 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         "",
         "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
         *(f"#define {name} {size}" for name, size in defined.items()),
+        f"#define FORGETTING ((REAL){float(observer.forgetting)!r})",
+        f"#define FORGOTTEN ((REAL){observer.forgotten_in(seconds)!r})",
         f"#define WEIGHT_TOLERANCE {WEIGHT_TOLERANCE!r}",
         f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
         f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
         f"#define MOST_ROWS {MOST_ROWS!r}",
         "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
         "",
-        *(line for name, table in _tables(observer).items() for line in table_lines(name, table)),
+        *(line for name, table in _tables(observer, seconds).items() for line in table_lines(name, table)),
         *table_lines("levels", filled_table(np.array([list(alarms.levels.values())]))),
         "",
         alarms.source(prefix),
@@ -180,7 +210,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
     return "\n".join(lines)
 
 
-def _tables(observer: ScheduledObserver) -> dict[str, FloatArray]:
+def _tables(observer: ScheduledObserver, seconds: float) -> dict[str, FloatArray]:
     """Return the numbers of the observer and of its region, by their names in C."""
     held = observer.scheduling
     tables: dict[str, FloatArray] = {
@@ -188,7 +218,7 @@ def _tables(observer: ScheduledObserver) -> dict[str, FloatArray]:
         "lowest": held.low[None],
         "highest": held.high[None],
         "middle": observer.middle[None],
-        "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
+        "steps": np.minimum(observer.steps_in(seconds), np.finfo(np.float64).max)[None],
         "Cz": observer.Cz,
         "Dy": observer.Dy,
         "Az": np.vstack(list(observer.Az)),

@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import Alarms, ExportedMonitor, Monitor, linear_alarms, scheduled_alarms
 from obsynth.exporting.c_precision import in_precision
-from obsynth.exporting.c_scheduled import scheduled_c_texts
+from obsynth.exporting.c_scheduled import scheduled_c_texts, seconds_between_rows
 from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
 from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
 from obsynth.exporting.dae_c_source import dae_alarms, threshold_header, threshold_source, write_dae_c
@@ -96,7 +96,8 @@ def export(
         ``alarm[...]``, parameters ``operating_point[...]``, ``threshold[...]`` and ``warm_up``, with units.
         ``.json``: a proof file in whole numbers, which a program of one file checks without obsynth.
     sample_time : float, optional, seconds
-        Samples a continuous-time observer by a first-order hold; needed for C and an FMU.
+        Samples a continuous-time observer by a first-order hold, one over a region by the steps of implicit Euler that
+        it takes on logs; needed for C and an FMU.
     fmi : str, optional
         Version of FMI, ``"2.0"`` (the default) or ``"3.0"``; for ``.fmu`` only.
     thresholds : mapping, optional
@@ -264,27 +265,19 @@ def _write_scheduled(
         )
     if arrays:
         return (write_atomically(target, _array_file(scheduled_arrays(design), design, suffix)),)
-    if design.scheduled[1].dt == 0.0:
-        raise SpecError(
-            "The observer over a region is continuous in time, and solves linear equations at each row: it runs on "
-            "logs (obsynth.run_on_data); C and FMUs are written of those for plants in discrete time (dt).",
-            path="path",
-        )
-    if sample_time is not None or numbers != "double":
-        raise SpecError(
-            "A design over a region is written in doubles, at the sample time of its plant: leave sample_time and "
-            "precision out.",
-            path="precision" if sample_time is None else "sample_time",
-        )
+    if numbers != "double":
+        raise SpecError("A design over a region is written in doubles: leave precision out.", path="precision")
+    seconds = seconds_between_rows(design.scheduled[1], sample_time)
     written = None if monitor is None else registered("monitor_in_c")(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 
-        options: Any = {"sample_time": None, "thresholds": thresholds, "warm_up": warm_up, "monitor": written}
+        options: Any = {"sample_time": sample_time, "thresholds": thresholds, "warm_up": warm_up, "monitor": written}
         return (write_fmu(design, target, version=fmi or "2.0", **options),)
     alarms = scheduled_alarms(design.scheduled[1], thresholds, warm_up, written)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declared = (in_precision(text, numbers) for text in scheduled_c_texts(design, prefix, header.name, alarms))
+    texts = scheduled_c_texts(design, prefix, header.name, alarms, seconds)
+    source, declared = (in_precision(text, numbers) for text in texts)
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.exporting.alarms import STATISTIC, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
+from obsynth.monitoring.thresholds.euler_rule import EulerRule
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, LearnedRule, follow_shares
@@ -287,6 +288,13 @@ def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC 
 
 def _region_monitor(monitor: Monitor, observer: ScheduledObserver) -> RegionMonitorInC:
     monitor.require_fit(len(observer.residual_names), observer.fault_names)
+    if isinstance(monitor.rule, EulerRule):
+        raise SpecError(
+            "The guaranteed threshold of a design over a region in continuous time follows the rows, by enclosures of "
+            "the functions of the parameters between two of them, which are not written as C: run it with "
+            "obsynth.run_on_data, or give levels of the outputs (thresholds={...}, --threshold) for C.",
+            path="monitor",
+        )
     bound = monitor.rule.bound_by_row if isinstance(monitor.rule, NormRule) else None
     if monitor.kind != "pointwise" or bound is None:
         raise SpecError(

@@ -14,7 +14,7 @@ from pathlib import Path
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import ExportedMonitor, linear_alarms, scheduled_alarms
 from obsynth.exporting.c_precision import in_precision
-from obsynth.exporting.c_scheduled import scheduled_c_texts
+from obsynth.exporting.c_scheduled import scheduled_c_texts, seconds_between_rows
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import build_description, model_description
@@ -86,9 +86,13 @@ def _contents(
         return signals_of_dae(design, alarms), (text, declared), digest
     if isinstance(design.observer, ScheduledObserver):
         plant, observer = design.scheduled
-        alarms = scheduled_alarms(observer, thresholds, warm_up, monitor)
-        source, declared = (in_precision(text, "double") for text in scheduled_c_texts(design, PREFIX, header, alarms))
-        return signals_of_scheduled(plant, observer, alarms), (source, declared), gain_set_digest(design)
+        alarms, seconds = (
+            scheduled_alarms(observer, thresholds, warm_up, monitor),
+            seconds_between_rows(observer, sample_time),
+        )
+        texts = scheduled_c_texts(design, PREFIX, header, alarms, seconds)
+        source, declared = (in_precision(text, "double") for text in texts)
+        return signals_of_scheduled(plant, observer, alarms, seconds), (source, declared), gain_set_digest(design)
     realisation = Realisation.of(design, sample_time)
     if realisation.observer.dt == 0.0:
         raise SpecError(

@@ -58,8 +58,11 @@ def signals_of_linear(realisation: Realisation, alarms: Alarms) -> FmuSignals:
     return FmuSignals(inputs, realisation.inputs, tuple(outputs), points, alarms, units, observer.dt)
 
 
-def signals_of_scheduled(plant: PolytopicSystem, observer: ScheduledObserver, alarms: Alarms) -> FmuSignals:
-    """Return the signals of a scheduled observer: its parameters are inputs, and the status of a row is an output."""
+def signals_of_scheduled(
+    plant: PolytopicSystem, observer: ScheduledObserver, alarms: Alarms, seconds: float
+) -> FmuSignals:
+    """Return the signals of a scheduled observer: its parameters are inputs, and the status of a row is an output;
+    ``seconds`` are between rows."""
     held, known = observer.scheduling, observer.input_names[: observer.inputs]
     known = tuple(name for name in known if name != plant.shift)
     read = observer.input_names[observer.inputs :]
@@ -77,7 +80,7 @@ def signals_of_scheduled(plant: PolytopicSystem, observer: ScheduledObserver, al
         points,
         alarms,
         {**held.units, **units},
-        observer.dt,
+        seconds,
         dict(zip(named, observer.middle.tolist(), strict=True)),
     )
 

@@ -80,47 +80,50 @@ static void fixed(const REAL *matrix, int rows, int columns, const REAL *x, REAL
     }
 }
 
-#if DIVIDES
-/* Solve (sum of weights times effectiveness) x = x, by elimination with pivots. */
-static void divided(const REAL *weights, REAL *x)
+#if DIVIDES || IS_CONTINUOUS
+/* Solve a x = x, by elimination with pivots; a is n by n and is overwritten. */
+static void solve(REAL *a, int n, REAL *x)
 {
-    REAL a[FAULT_COUNT][FAULT_COUNT];
-    int i, j, k, v;
-    for (i = 0; i < FAULT_COUNT; i++) {
-        for (j = 0; j < FAULT_COUNT; j++) {
-            a[i][j] = 0;
-            for (v = 0; v < VERTICES; v++) {
-                a[i][j] += weights[v] * effectiveness[v * FAULT_COUNT + i][j];
-            }
-        }
-    }
-    for (k = 0; k < FAULT_COUNT; k++) {
+    int i, j, k;
+    for (k = 0; k < n; k++) {
         int best = k;
         REAL kept;
-        for (i = k + 1; i < FAULT_COUNT; i++) {
-            best = fabs(a[i][k]) > fabs(a[best][k]) ? i : best;
+        for (i = k + 1; i < n; i++) {
+            best = fabs(a[i * n + k]) > fabs(a[best * n + k]) ? i : best;
         }
-        for (j = 0; j < FAULT_COUNT; j++) {
-            kept = a[k][j];
-            a[k][j] = a[best][j];
-            a[best][j] = kept;
+        for (j = 0; j < n; j++) {
+            kept = a[k * n + j];
+            a[k * n + j] = a[best * n + j];
+            a[best * n + j] = kept;
         }
         kept = x[k];
         x[k] = x[best];
         x[best] = kept;
-        for (i = k + 1; i < FAULT_COUNT; i++) {
-            const REAL factor = a[i][k] / a[k][k];
-            for (j = k; j < FAULT_COUNT; j++) {
-                a[i][j] -= factor * a[k][j];
+        for (i = k + 1; i < n; i++) {
+            const REAL factor = a[i * n + k] / a[k * n + k];
+            for (j = k; j < n; j++) {
+                a[i * n + j] -= factor * a[k * n + j];
             }
             x[i] -= factor * x[k];
         }
     }
-    for (k = FAULT_COUNT - 1; k >= 0; k--) {
-        for (j = k + 1; j < FAULT_COUNT; j++) {
-            x[k] -= a[k][j] * x[j];
+    for (k = n - 1; k >= 0; k--) {
+        for (j = k + 1; j < n; j++) {
+            x[k] -= a[k * n + j] * x[j];
         }
-        x[k] /= a[k][k];
+        x[k] /= a[k * n + k];
+    }
+}
+
+/* A square matrix, the sum over the vertices of weights times matrices. */
+static void mean_matrix(const REAL *tables, int n, const REAL *weights, REAL *sum)
+{
+    int v, i;
+    for (i = 0; i < n * n; i++) {
+        sum[i] = 0;
+        for (v = 0; v < VERTICES; v++) {
+            sum[i] += weights[v] * tables[(long)v * n * n + i];
+        }
     }
 }
 #endif
@@ -179,6 +182,9 @@ int PREFIX_step(STEP_ARGUMENTS)
 {
     REAL weights[VERTICES], next[LENGTH(Z_COUNT)] = {0}, rows[ROW_COUNT] = {0};
     int i, whole = 1;
+#if IS_CONTINUOUS
+    const int is_first = !s->is_started;
+#endif
     COPY_U
     for (i = 0; i < Y_COUNT; i++) {
         if (isfinite(y[i])) {
@@ -202,8 +208,26 @@ int PREFIX_step(STEP_ARGUMENTS)
     }
     {
         const int inside = scheduling_of(s, u + U_COUNT, weights);
-        s->unclaimed = inside ? (s->unclaimed > 0 ? s->unclaimed - 1 : 0) : FORGETTING;
+        s->unclaimed = inside ? fmax(s->unclaimed - FORGOTTEN, 0) : FORGETTING;
     }
+#if IS_CONTINUOUS
+    if (!is_first) {
+        /* A step of implicit Euler: (I - h Az) z = z + h (Bu u + By y). */
+        REAL matrix[LENGTH(Z_COUNT) * LENGTH(Z_COUNT)];
+        mean_matrix(&Az[0][0], Z_COUNT, weights, matrix);
+        scheduled(&By[0][0], Z_COUNT, Y_COUNT, weights, s->y, next);
+#if U_COUNT
+        scheduled(&Bu[0][0], Z_COUNT, U_COUNT, weights, s->u, next);
+#endif
+        for (i = 0; i < Z_COUNT * Z_COUNT; i++) {
+            matrix[i] = (i % (Z_COUNT + 1) == 0 ? 1 : 0) - (REAL)UPPER_DT * matrix[i];
+        }
+        for (i = 0; i < Z_COUNT; i++) {
+            s->z[i] += (REAL)UPPER_DT * next[i];
+        }
+        solve(matrix, Z_COUNT, s->z);
+    }
+#endif
     fixed(&Cz[0][0], ROW_COUNT, Z_COUNT, s->z, rows);
     fixed(&Dy[0][0], ROW_COUNT, Y_COUNT, s->y, rows);
 #if U_COUNT
@@ -221,8 +245,13 @@ int PREFIX_step(STEP_ARGUMENTS)
     }
 #endif
 #if DIVIDES
-    divided(s->weights, rows + STATE_COUNT);
+    {
+        REAL effect[FAULT_COUNT * FAULT_COUNT];
+        mean_matrix(&effectiveness[0][0], FAULT_COUNT, s->weights, effect);
+        solve(effect, FAULT_COUNT, rows + STATE_COUNT);
+    }
 #endif
+#if !IS_CONTINUOUS
     scheduled(&Az[0][0], Z_COUNT, Z_COUNT, weights, s->z, next);
     scheduled(&By[0][0], Z_COUNT, Y_COUNT, weights, s->y, next);
 #if U_COUNT
@@ -231,6 +260,7 @@ int PREFIX_step(STEP_ARGUMENTS)
     for (i = 0; i < Z_COUNT; i++) {
         s->z[i] = next[i];
     }
+#endif
     for (i = 0; i < VERTICES; i++) {
         s->weights[i] = weights[i];
     }
@@ -238,8 +268,8 @@ int PREFIX_step(STEP_ARGUMENTS)
         for (i = 0; i < ROW_COUNT; i++) {
             rows[i] = NAN;
         }
-        if (s->settling <= FORGETTING) {
-            s->settling = FORGETTING;
+        if (s->settling <= RECOVERING_ROWS) {
+            s->settling = RECOVERING_ROWS;
         }
     }
     COPY_ROWS

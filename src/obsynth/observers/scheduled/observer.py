@@ -277,8 +277,18 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     @cached_property
     def steps(self) -> FloatArray:
         """How far parameters may move within a sample; infinite where no rate is stated."""
+        return self.steps_in(self.dt)
+
+    def steps_in(self, seconds: float) -> FloatArray:
+        """Return how far parameters ``(p,)`` may move in some seconds; infinite where no rate is stated.
+
+        Parameters
+        ----------
+        seconds : float
+            Above 0.
+        """
         rates = [np.inf if rate is None else rate for rate in self.scheduling.rates]
-        return np.array(rates) * self.dt * (1.0 + RATE_TOLERANCE)
+        return np.array(rates) * seconds * (1.0 + RATE_TOLERANCE)
 
     def advance(
         self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float = 0.0
@@ -333,11 +343,10 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         driven = state.z + seconds * (Bu @ inputs + By @ y)
         z = np.asarray(np.linalg.solve(np.eye(self.order) - seconds * Az, driven)) if seconds > 0.0 else state.z
         row = self.Cz @ z + self.Du @ inputs + self.Dy @ y
-        rates = np.array([np.inf if rate is None else rate for rate in self.scheduling.rates])
-        far = rates * (seconds if seconds > 0.0 else np.inf) * (1.0 + RATE_TOLERANCE)
+        far = self.steps_in(seconds if seconds > 0.0 else np.inf)
         slow = not bool((np.abs(measured - state.parameters) > far).any())
         inside = slow and self.scheduling.is_inside(measured)
-        unclaimed = max(state.unclaimed - self._forgotten(seconds), 0.0) if inside else self.forgetting
+        unclaimed = max(state.unclaimed - self.forgotten_in(seconds), 0.0) if inside else self.forgetting
         return ScheduledState(z, weights, parameters, unclaimed), row
 
     def rows_without_claim(self, seconds: float) -> int:
@@ -350,10 +359,19 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         """
         if self.dt > 0.0 or not self.forgetting:
             return int(self.forgetting)
-        return int(np.ceil(self.forgetting / self._forgotten(seconds)))
+        return int(np.ceil(self.forgetting / self.forgotten_in(seconds)))
 
-    def _forgotten(self, seconds: float) -> float:
-        """Return the seconds of the exact observer in which an error shrinks as it does in one step of these."""
+    def forgotten_in(self, seconds: float) -> float:
+        """Return by how much a row brings the end of `forgetting` nearer: 1 in discrete time, else the seconds of the
+        exact observer in which an error shrinks as it does in one step of implicit Euler.
+
+        Parameters
+        ----------
+        seconds : float
+            Since the row before.
+        """
+        if self.dt > 0.0:
+            return 1.0
         if self.forgetting == 0.0:
             return 0.0
         rate = -np.log(FORGOTTEN_SHARE) / self.forgetting
