@@ -59,8 +59,8 @@ from obsynth.plants.faults import fault_model as fault_model
 from obsynth.plants.importing.andes import from_andes as from_andes
 from obsynth.plants.importing.casadi_models import from_casadi as from_casadi
 from obsynth.plants.importing.fmu import from_fmu as from_fmu
-from obsynth.plants.importing.model_files import from_matlab as from_matlab
-from obsynth.plants.importing.model_files import from_modelica as from_modelica
+from obsynth.plants.importing.matlab_models import from_matlab as from_matlab
+from obsynth.plants.importing.modelica_models import from_modelica as from_modelica
 from obsynth.plants.importing.python_objects import from_control as from_control
 from obsynth.plants.importing.python_objects import from_pandas as from_pandas
 from obsynth.plants.importing.python_objects import from_scipy as from_scipy

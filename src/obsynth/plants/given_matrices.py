@@ -74,10 +74,21 @@ def _without_frames(
         frame: Any = plain.get(name)
         if not (hasattr(frame, "columns") and hasattr(frame, "index") and hasattr(frame, "to_numpy")):
             continue
+        _require_no_texts(frame, name)
         rows = _order(frame.index, _FIELDS[rows_of], labels, f"the rows of {name}")
         columns = _order(frame.columns, _FIELDS[columns_of], labels, f"the columns of {name}")
         plain[name] = frame.to_numpy()[rows][:, columns] if len(frame) else frame.to_numpy()
     return plain, labels
+
+
+def _require_no_texts(frame: Any, name: str) -> None:
+    """Refuse a frame whose first column are labels: of a table that was read without saying so."""
+    if len(frame) and len(frame.columns) and all(isinstance(cell, str) for cell in frame.iloc[:, 0]):
+        raise SpecError(
+            f"{name} has texts in its first column, {str(frame.columns[0])!r}: names of rows belong into the index of "
+            "a frame; read the table with index_col=0.",
+            path=name,
+        )
 
 
 def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what: str) -> list[int]:

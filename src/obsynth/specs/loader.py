@@ -27,8 +27,8 @@ from obsynth.specs.documents import DocumentProblems, checked_plant, checked_spe
 from obsynth.specs.plant_sections import (
     boxed_constants,
     built_plant,
+    imported_plant,
     joined,
-    matlab_plant,
     noise_model_of,
     noise_needs_states,
     none_of_noise,
@@ -226,9 +226,9 @@ def spec_of(
     """
     checked, raw_options = checked_spec(document, source)
     reference: Any = checked.plant if hasattr(checked.plant, "file") else None
-    section, plant_source, prefix, from_mat = _plant_section(checked.plant, source, plant_changes or {})
+    section, plant_source, prefix, imported = _plant_section(checked.plant, source, plant_changes or {})
     options = _options_as_read(raw_options, source)
-    plant = built_plant(section, plant_source, prefix) if from_mat is None else from_mat
+    plant = built_plant(section, plant_source, prefix) if imported is None else imported
     transformation: Transformation | None = None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
     transform: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
@@ -303,10 +303,10 @@ def _steps_of_linear_plant(
 
 
 def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tuple[Any, Path, str, Any]:
-    """Return the section of a plant, the file and place in it where it stands, and the plant where MATLAB wrote it."""
-    from_mat = matlab_plant(section, source) if hasattr(section, "file") else None
-    if from_mat is not None or not hasattr(section, "file"):
-        return section, source, "plant", from_mat
+    """Return the section of a plant, the file and place in it where it stands, and the plant of another tool."""
+    imported = imported_plant(section, source) if hasattr(section, "file") else None
+    if imported is not None or not hasattr(section, "file"):
+        return section, source, "plant", imported
     place = source.parent / section.file
     return checked_plant(changed_document(read_yaml(place, where="plant.file"), changes), place), place, "", None
 

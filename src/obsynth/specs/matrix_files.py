@@ -124,7 +124,7 @@ def _numpy_archive(path: Path) -> dict[str, Any]:
 
 
 def _matlab_archive(path: Path) -> dict[str, Any]:
-    from obsynth.plants.importing.model_files import mat_arrays
+    from obsynth.plants.importing.matlab_models import mat_arrays
 
     return mat_arrays(path)
 

@@ -36,6 +36,19 @@ _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
 
 _LABELS = ("operating_point", "scales", "units")
 
+#: What a file of OpenModelica does not leave open.
+_OF_MATLAB = ("variable", "dt")
+
+#: Files of plants that no spec refers to, and the way to them.
+_OTHER_PLANTS = {
+    ".fmu": "obsynth.from_fmu linearises it, in Python",
+    ".xlsx": "save each sheet as .csv, and give A: {file: A.csv} and so on, or read it in Python",
+    ".xls": "save each sheet as .csv, and give A: {file: A.csv} and so on, or read it in Python",
+    ".csv": "a matrix is given as A: {file: A.csv}",
+    ".npz": "a matrix is given as A: {file: plant.npz, variable: A}",
+    ".mtx": "a matrix is given as A: {file: A.mtx}",
+}
+
 #: Noise of a nonlinear plant, which its linear model or the options of a method take; and what `with_noise` takes.
 _TAKEN_NOISE = ("sensor_noise", "process_noise")
 
@@ -235,18 +248,30 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
     return _placed(made, source, prefix)
 
 
-def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
-    """Return the plant in a ``.mat`` file that a spec refers to; `None` where it refers to another kind of file."""
+def imported_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
+    """Return the plant in a file of another tool that a spec refers to; `None` where it refers to a document."""
     arguments = reference.model_dump(exclude={"file", "transform"}, exclude_none=True)
-    if Path(reference.file).suffix.lower() == ".mat":
-        from obsynth.plants.importing.model_files import from_matlab
+    path, suffix = spec.parent / reference.file, Path(reference.file).suffix.lower()
+    if suffix == ".mat":
+        from obsynth.plants.importing.matlab_models import from_matlab
 
-        return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
-    if arguments:
+        return _placed(lambda: from_matlab(path, **arguments), spec, "plant")
+    wrong = [name for name in arguments if suffix != ".mo" or name in _OF_MATLAB]
+    if wrong:
+        what = "a linear model of OpenModelica, which says that itself" if suffix == ".mo" else "no .mat or .mo file"
+        remedy = "remove it" if suffix == ".mo" else f"it belongs into {reference.file}"
         raise SpecError(
-            f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: it belongs "
-            f"into {reference.file}.",
-            path=f"plant.{next(iter(arguments))}",
+            f"{spec}: plant.{wrong[0]}: unknown key beside a file that is {what}: {remedy}.", path=f"plant.{wrong[0]}"
+        )
+    if suffix == ".mo":
+        from obsynth.plants.importing.modelica_models import from_modelica
+
+        return _placed(lambda: from_modelica(path, **arguments), spec, "plant")
+    if suffix in _OTHER_PLANTS:
+        raise SpecError(
+            f"{spec}: plant.file: a plant is read from another spec (.yaml), a .mat or a .mo file, not from "
+            f"{reference.file}: {_OTHER_PLANTS[suffix]}.",
+            path="plant.file",
         )
     return None
 

@@ -175,9 +175,11 @@ class PlantSection(Section):
 
 
 class PlantReference(Section):
-    """A plant in another file: ``{file: plant.yaml}``, whose transform may be replaced, or ``{file: plant.mat}``.
+    """A plant in another file: ``{file: plant.yaml}``, whose transform may be replaced, ``{file: plant.mat}``, or
+    ``{file: linearized_model.mo}``.
 
-    All but the first two entries are for ``.mat`` files, and are arguments of `obsynth.from_matlab`.
+    All but the first two entries are for ``.mat`` and ``.mo`` files, and are arguments of `obsynth.from_matlab` and
+    `obsynth.from_modelica`.
     """
 
     file: Text

@@ -12,6 +12,12 @@ import scipy.sparse
 from obsynth.numerics.arrays import require_readable
 from obsynth.numerics.libraries import imported
 
+#: What to save in MATLAB in place of an object.
+WHAT_TO_SAVE = (
+    "Of a system write there [A,B,C,D,E,Ts] = dssdata({name}); save('plant.mat','A','B','C','D','E','Ts'), or "
+    "s = struct({name}); save('plant.mat','s'), which keeps the names; leave other objects out of the file"
+)
+
 #: What a struct of a system has for remarks: objects there (MATLAB's strings) are left out.
 _REMARKS = ("Notes", "UserData")
 
@@ -70,9 +76,8 @@ def _require_no_object(item: Any, kind: str) -> None:
         return
     name = str(item.name).strip("/").replace("/", ".")
     raise ValueError(
-        f"{name} is an object of MATLAB's class {kind} in a file of version 7.3, which MATLAB alone can unpack. Of a "
-        f"system write there [A,B,C,D,E,Ts] = dssdata({name}); save('plant.mat','A','B','C','D','E','Ts'), or "
-        f"s = struct({name}); save('plant.mat','s'), which keeps the names; leave other objects out of the file"
+        f"{name} is an object of MATLAB's class {kind} in a file of version 7.3, which MATLAB alone can unpack. "
+        f"{WHAT_TO_SAVE.format(name=name)}"
     )
 
 

@@ -100,6 +100,12 @@ def from_control(
             f"system is a {type(system).__name__} of scipy: from_scipy reads it, and from_control those of control.",
             path="system",
         )
+    if isinstance(system, control.NonlinearIOSystem) and not isinstance(system, control.StateSpace):
+        raise SpecError(
+            f"system is a {type(system).__name__}, which is not linear: give control.linearize(system, x0, u0) at an "
+            "equilibrium, and its values as operating_point={...}; its equations as they are go into a DAEModel.",
+            path="system",
+        )
     require_kind(
         system,
         (control.StateSpace, control.TransferFunction),
@@ -176,6 +182,12 @@ def from_scipy(
     [[-1.0]]
     """
     signal = imported("scipy.signal", extra=None)
+    if type(system).__module__.startswith("control."):
+        raise SpecError(
+            f"system is a {type(system).__name__} of python-control: from_control reads it, and from_scipy those of "
+            "scipy.signal.",
+            path="system",
+        )
     require_kind(system, (signal.lti, signal.dlti), "system", "a scipy.signal.StateSpace")
     if isinstance(system, signal.lti) and plant.get("dt"):
         raise SpecError(
@@ -231,6 +243,8 @@ def _sampling_time(own: Any, dt: float | None) -> float:
     """Return the sampling time: ``None`` is continuous, ``True`` unsaid; two that differ are refused."""
     if own is True and dt is None:
         raise SpecError("The system is sampled, but has no sampling time: give dt in seconds.", path="dt")
+    if own is True and dt == 0.0:
+        raise SpecError("The system is sampled, and dt = 0 is continuous time: give dt in seconds, above 0.", path="dt")
     if own is None or own is True:
         return 0.0 if dt is None else dt
     if dt is not None and dt != own:
@@ -251,7 +265,8 @@ def from_sympy(
     B, C : sympy.Matrix, optional
         ``(nx, nu)``, ``(ny, nx)``.
     parameters : mapping, optional
-        Value of each symbol, by the symbol or by its name.
+        Value of each symbol, by the symbol or by its name; of functions of time (``dynamicsymbols``) the value at the
+        point of the linear model, as ``{theta: 0, theta.diff(): 0}``.
     **plant
         Any other argument of `DescriptorSystem`: matrices (``E``, ``Bf``, ``Bd``, ``D``, ...) may be of sympy too, and
         names may be symbols.
@@ -275,14 +290,20 @@ def from_sympy(
     [[-0.5]]
     """
     sympy = imported("sympy", extra="sympy")
+    if isinstance(A, sympy.Basic) and not isinstance(A, (sympy.MatrixBase, sympy.NDimArray)):
+        raise SpecError(
+            f"A is a {type(A).__name__} of sympy, and matrices are read: of a StateSpace give its matrices, "
+            "from_sympy(model.A, model.B, model.C, D=model.D); of a transfer function a realisation.",
+            path="A",
+        )
     matrices = {"A": A, "B": B, "C": C, **plant}
     symbolic = {name: sympy.Matrix(matrices[name]) for name in ALL_MATRICES if _is_symbolic(matrices.get(name), sympy)}
-    free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
+    free = {str(symbol) for matrix in symbolic.values() for symbol in _unknowns(matrix, sympy)}
     values = {str(name): value for name, value in (parameters or {}).items()}
     _require_values(free, values)
     arguments = {name: value for name, value in matrices.items() if value is not None}
     for name, matrix in symbolic.items():
-        numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in matrix.free_symbols}
+        numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in _unknowns(matrix, sympy)}
         arguments[name] = _evaluated(matrix, numbers, name)
     for name in SIGNAL_NAMES:
         if arguments.get(name) is not None:
@@ -325,10 +346,19 @@ def from_pandas(A: Any, B: Any = None, C: Any = None, **plant: Any) -> Descripto
     return DescriptorSystem(**{"E": None, "A": A, "B": B, "C": C, **plant})
 
 
+def _unknowns(matrix: Any, sympy: Any) -> list[Any]:
+    """Return what needs a value in a matrix: functions of time (``dynamicsymbols``) and their derivatives, the highest
+    first, since a function without its value hides in its derivative; then symbols."""
+    functions = matrix.atoms(sympy.Derivative, sympy.core.function.AppliedUndef)
+    outer = sorted(functions, key=lambda entry: (-getattr(entry, "derivative_count", 0), str(entry)))
+    return [*outer, *sorted(matrix.subs({entry: 0 for entry in outer}).free_symbols, key=str)]
+
+
 def _is_symbolic(value: Any, sympy: Any) -> bool:
-    if isinstance(value, sympy.MatrixBase):
+    if isinstance(value, (sympy.MatrixBase, sympy.NDimArray)):
         return True
-    rows = value if isinstance(value, Sequence) and not isinstance(value, str) else ()
+    rows = value.tolist() if isinstance(value, np.ndarray) and value.dtype == object else value
+    rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else ()
     return any(isinstance(entry, sympy.Basic) for row in rows if isinstance(row, Sequence) for entry in row)
 
 
@@ -372,7 +402,9 @@ def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray
     dense = np.zeros((rows, columns))
     for i in range(rows):
         for j in range(columns):
-            entry = matrix[i, j].subs(numbers)
+            entry = matrix[i, j]
+            for unknown, number in numbers.items():
+                entry = entry.subs(unknown, number)
             if not (entry.is_number and entry.is_real and entry.is_finite):
                 raise SpecError(
                     f"{name}, row {i + 1}, column {j + 1}: {matrix[i, j]} is {entry} at these parameters; "

@@ -1,10 +1,8 @@
-"""Linear models in files: ``.mat`` files of MATLAB, and ``linearized_model.mo`` of OpenModelica's ``linearize``."""
+"""Linear models in ``.mat`` files of MATLAB: matrices, structs of systems, results of Simulink's ``linmod``."""
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,13 +12,15 @@ import numpy as np
 import scipy
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import READING_ERRORS, path_of, read_text
-from obsynth.numerics.arguments import arguments_checked, number_in_text
+from obsynth.files.inputs import READING_ERRORS, path_of
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, require_readable
 from obsynth.numerics.suggestions import there_are
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.importing.hdf5_models import hdf5_arrays
+from obsynth.plants.importing.dymola_models import fields_of_dslin
+from obsynth.plants.importing.hdf5_models import WHAT_TO_SAVE, hdf5_arrays
 from obsynth.plants.importing.roles import plant_of
+from obsynth.plants.signal_names import unused_names
 
 _MODEL_MATRICES = ("E", "A", "B", "C", "D")
 
@@ -33,6 +33,9 @@ _MATLAB_NAMES = {
     "OutputName": "output_names",
     **{f"{kind}_names": f"{kind}_names" for kind in ("state", "input", "output", "fault", "disturbance", "noise")},
 }
+
+#: Letters of signals without names.
+_LETTERS = {"state_names": "x", "input_names": "u", "output_names": "y"}
 
 _SAMPLE_TIME_NAMES = ("Ts", "dt")
 
@@ -56,6 +59,9 @@ _POINTS = {"x0": "state_names", "u0": "input_names", "y0": "output_names"}
 
 #: MATLAB's operating point of a linearised model: ``dx`` is the rate there, which a linear model has no term for.
 _OFFSETS = {"x": "x0", "u": "u0", "y": "y0"}
+
+#: What has an operating point as a struct, and entries of it that are of no signal: ``linmod`` writes the time.
+_POINT_STRUCTS = {"Offsets": ("dx",), "OperPoint": ("t",)}
 
 _UNIT_FIELDS = {"StateUnit": "state_names", "InputUnit": "input_names", "OutputUnit": "output_names"}
 
@@ -93,27 +99,6 @@ _OCTAVE_NAMES = {
     "userdata": "UserData",
 }
 
-_SIZE = re.compile(r"parameter\s+Integer\s+([nmpkl])\s*=\s*(\d+)")
-
-_MODELICA_MATRIX = re.compile(r"parameter\s+Real\s+([ABCD])\s*\[[^\]]*\]\s*=\s*(\[[^\]]*\]|zeros\([^)]*\))\s*;")
-
-_POINT = re.compile(r"parameter\s+Real\s+([xu])0\s*\[[^\]]*\]\s*=\s*(\{[^}]*\}|zeros\([^)]*\)|fill\([^)]*\))\s*;")
-
-_ALIAS = re.compile(r"Real\s+'([xuy])_([^']*)'\s*=\s*([xuy])\[(\d+)\]\s*;")
-
-_PARAMETER = re.compile(r"parameter\s+\w+\s+(\w+)")
-
-#: What OpenModelica declares: sizes, operating point, matrices; those with z recover all variables of the model.
-_MODELICA_PARAMETERS = frozenset((*"nmpklABCD", "x0", "u0", "z0", "nz", "Cz", "Dz"))
-
-_EQUATION = re.compile(r"\bequation\b(.*?)\bend\b", re.DOTALL)
-
-#: The equations of a linear model, without blanks; any other changes what the matrices mean.
-_MODELICA_EQUATIONS = re.compile(r"(der\(x\)=A\*x(\+B\*u)?|y=C\*x(\+D\*u)?|z=Cz\*x(\+Dz\*u)?|y=D\*u|z=Dz\*u)")
-
-# OpenModelica makes outputs that are states into states of their own name.
-_OUTPUT_ALIAS = "$outputAlias_"
-
 
 @arguments_checked
 def from_matlab(
@@ -135,6 +120,7 @@ def from_matlab(
         ``InputName``, ``OutputName``, as
         ``struct(sys)`` has them, or ``state_names`` and so on).  May be left out where the file has one struct, or the
         matrices themselves.
+        A struct that ``linmod`` of Simulink returns is one, and so are matrices in a ``dslin.mat`` of Dymola.
     dt : float, optional, seconds
         Where the file does not say it; 0 for continuous time.
     **plant
@@ -145,8 +131,10 @@ def from_matlab(
     Returns
     -------
     DescriptorSystem
-        With the names and units in the file, in seconds whatever the ``TimeUnit``, with ``x0, u0, y0`` or MATLAB's
-        ``Offsets`` as operating point, and with ``InputDelay`` and ``OutputDelay`` as delays.
+        With the names and units in the file, in seconds whatever the ``TimeUnit``, with ``x0, u0, y0``, MATLAB's
+        ``Offsets`` or ``OperPoint`` of ``linmod`` (which has no outputs: add them by ``operating_point={...}``) as
+        operating point, and with ``InputDelay`` and ``OutputDelay`` as delays.  A name that is repeated gets a number,
+        and a line end in a name of a block of Simulink is a blank.
 
     Raises
     ------
@@ -166,17 +154,19 @@ def from_matlab(
     """
     source = path_of(path)
     content = _content(source)
+    if variable is None:
+        content = fields_of_dslin(content, source) or content
     fields = _fields(content, variable, source)
     if "A" not in fields:
         raise SpecError(
             f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
         )
     is_struct = fields is not content and fields.keys() != content.keys()
-    fields = _with_offsets(fields, source)
+    fields = _with_point(fields, source)
     _require_understood(fields, source, is_struct=is_struct)
     unit = _seconds_of_unit(fields, source)
     step = _step(fields, dt, unit, source)
-    names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
+    names = {ours: _names(fields[theirs], ours) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
     labels = {ours: names.pop(ours, None) for ours in ("state_names", "input_names", "output_names")}
     matrices = {name: _dense_value(fields[name]) for name in (*_MODEL_MATRICES, *_MORE) if name in fields}
     if step == 0.0 and unit != 1.0:
@@ -228,6 +218,14 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
             f"{source}: name the struct of the plant (variable=...); it has: {named_structs}.", path=str(source)
         )
     name = structs[0] if variable is None else variable
+    held = content.get(name)
+    if isinstance(held, scipy.io.matlab.MatlabOpaque):
+        kind = np.ravel(held)[0]["s2"]
+        raise SpecError(
+            f"{source}: {name} is an object of MATLAB's class {kind.decode() if isinstance(kind, bytes) else kind}, "
+            f"which MATLAB alone can unpack. {WHAT_TO_SAVE.format(name=name)}.",
+            path=str(source),
+        )
     if name not in structs:
         raise SpecError(
             f"{source} has no struct {name!r}; it has: {', '.join(map(repr, structs)) or 'none'}.", path=str(source)
@@ -279,22 +277,32 @@ def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: b
         )
 
 
-def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
-    """Return fields with the operating point of MATLAB's ``Offsets`` as ``x0``, ``u0`` and ``y0``."""
-    offsets: Any = fields.get("Offsets")
+def _with_point(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
+    """Return fields with the operating point of ``Offsets``, or of ``OperPoint``, as ``x0``, ``u0`` and ``y0``."""
+    struct = next((name for name in _POINT_STRUCTS if np.size(fields.get(name, ()))), "Offsets")
+    offsets: Any = fields.get(struct)
     if getattr(getattr(offsets, "dtype", None), "names", None) is None:
         return dict(fields)
-    rest = {name: value for name, value in fields.items() if name != "Offsets"}
+    rest = {name: value for name, value in fields.items() if name != struct}
     if offsets.size != 1:
         return rest if not offsets.size else dict(fields)
     record = offsets.reshape(-1)[0]
     values = {name: record[name] for name in offsets.dtype.names if np.size(record[name])}
-    unknown = [name for name in values if name not in (*_OFFSETS, "dx")]
+    known = (*_POINT_STRUCTS[struct], *_OFFSETS)
+    unknown = [name for name in values if name not in known]
     if unknown:
         raise SpecError(
-            f"{source}: Offsets has the field {unknown[0]!r}; {there_are(unknown[0], ('dx', 'x', 'u', 'y'))}",
+            f"{source}: {struct} has the field {unknown[0]!r}; {there_are(unknown[0], known)}",
             path=str(source),
         )
+    structured = [name for name in _OFFSETS if getattr(values.get(name), "dtype", np.dtype(float)).names]
+    if structured:
+        raise SpecError(
+            f"{source}: {struct}.{structured[0]} is a struct, and a vector of numbers is read: give "
+            f"operating_point={{...}}, and remove {struct} from the file.",
+            path=str(source),
+        )
+    values.pop("t", None)
     if not _is_at_rest(values.pop("dx", None), values.get("x"), sampled=_is_sampled(fields)):
         raise SpecError(
             f"{source}: by Offsets.dx the operating point is no equilibrium, and deviations from it obey no linear "
@@ -456,138 +464,17 @@ def _dense_value(value: Any) -> Any:
     return value.toarray() if hasattr(value, "toarray") else value
 
 
+def _names(value: Any, kind: str) -> list[str] | None:
+    """Return names of signals: blanks for the line ends in blocks of Simulink, a number behind those that are repeated
+    (``linmod`` names every state of a block alike), and numbered names for those that are empty among others."""
+    texts = _texts(value)
+    if texts is None or kind not in _LETTERS:
+        return texts
+    full = (re.sub(r"[\r\n]+", " ", text) or f"{_LETTERS[kind]}{i}" for i, text in enumerate(texts, 1))
+    return list(unused_names(list(full), ()))
+
+
 def _texts(value: Any) -> list[str] | None:
     """Return the texts of a cell array, or of a matrix of characters; `None` where all are empty, as MATLAB has it."""
     texts = [str(np.squeeze(cell)) if np.size(cell) else "" for cell in np.atleast_1d(value).ravel()]
     return [text.strip() for text in texts] if any(text.strip() for text in texts) else None
-
-
-@arguments_checked
-def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
-    """Return the plant of a linearised Modelica model, with the names of its variables.
-
-    Parameters
-    ----------
-    path : path
-        The file ``linearized_model.mo`` that OpenModelica's ``linearize`` (or ``-l=<time>``) writes.
-    **plant
-        Roles, as lists of names: ``faults`` and ``disturbances`` (inputs that are faults, or unknown; the others are
-        known inputs), ``actuator_faults`` (known inputs on which a fault acts: adds ``fault of <input>``) and
-        ``sensor_faults`` (outputs with a bias: adds ``bias of <output>``).  Any other argument of `DescriptorSystem`.
-
-    Returns
-    -------
-    DescriptorSystem
-        Continuous; states and known inputs have the values ``x0`` and ``u0`` of the file as operating point.  A model
-        without outputs measures all its states.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be read, or is no such model.
-
-    Notes
-    -----
-    The file does not hold the outputs at the operating point: add them by ``operating_point={...}``.  Constant terms
-    are not in it either: linearise in a steady state.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> import obsynth
-    >>> text = (
-    ...     "model linearized_model parameter Integer n = 1; parameter Integer m = 1; parameter Integer p = 1;"
-    ...     " parameter Real A[n, n] = [-1]; parameter Real B[n, m] = [1]; parameter Real C[p, n] = [1];"
-    ...     " parameter Real D[p, m] = [0]; Real 'x_level' = x[1]; Real 'u_inflow' = u[1]; Real 'y_gauge' = y[1];"
-    ...     " end linearized_model;"
-    ... )
-    >>> with TemporaryDirectory() as folder:
-    ...     file = Path(folder) / "linearized_model.mo"
-    ...     _ = file.write_text(text)
-    ...     plant = obsynth.from_modelica(file)
-    >>> plant.A.tolist()
-    [[-1.0]]
-    """
-    source = path_of(path)
-    if not source.exists():
-        raise SpecError(f"{source} cannot be read: {os.strerror(errno.ENOENT)}.", path=str(source))
-    text = re.sub(r"//[^\n]*|/\*.*?\*/", "", read_text(source), flags=re.DOTALL)
-    sizes = {name: int(count) for name, count in _SIZE.findall(text)}
-    bodies = {name: body for name, body in _MODELICA_MATRIX.findall(text)}
-    if "m" not in sizes and "p" not in sizes:
-        # Older versions call them so.
-        sizes |= {new: sizes[old] for new, old in (("m", "k"), ("p", "l")) if old in sizes}
-    missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in bodies]
-    if missing:
-        raise SpecError(
-            f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.", path=str(source)
-        )
-    _require_plain_model(text, source)
-    shapes = {"A": ("n", "n"), "B": ("n", "m"), "C": ("p", "n"), "D": ("p", "m")}
-    matrices = {
-        name: _matrix(bodies[name], sizes[rows], sizes[columns], name, source)
-        for name, (rows, columns) in shapes.items()
-    }
-    names = {kind: [f"{kind}{i + 1}" for i in range(sizes[size])] for kind, size in zip("xuy", "nmp", strict=True)}
-    for kind, name, array, number in _ALIAS.findall(text):
-        if kind == array and int(number) <= len(names[kind]):
-            names[kind][int(number) - 1] = name.removeprefix(_OUTPUT_ALIAS)
-    points = dict(_POINT.findall(text))
-    point = {
-        name: value
-        for kind in "xu"
-        for name, value in zip(
-            names[kind], _numbers(points.get(kind, ""), len(names[kind]), f"{kind}0", source), strict=True
-        )
-    }
-    measured = sizes["p"] > 0
-    if not measured:
-        matrices |= {"C": np.eye(sizes["n"]), "D": np.zeros((sizes["n"], sizes["m"]))}
-    labels = {"state_names": names["x"], "input_names": names["u"], "output_names": names["y" if measured else "x"]}
-    return plant_of(matrices, plant, labels=labels, dt=0.0, point=point)
-
-
-def _require_plain_model(text: str, source: Path) -> None:
-    """Refuse, by name, parameters and equations that a linear model of OpenModelica does not have."""
-    unknown = [name for name in _PARAMETER.findall(text) if name not in _MODELICA_PARAMETERS]
-    if unknown:
-        raise SpecError(
-            f"{source} declares {', '.join(unknown)}, which a linear model of OpenModelica does not have: its meaning "
-            "is not known here. Give the file as OpenModelica writes it.",
-            path=str(source),
-        )
-    for section in _EQUATION.findall(text):
-        for equation in filter(None, (re.sub(r"\s", "", part) for part in section.split(";"))):
-            if not _MODELICA_EQUATIONS.fullmatch(equation):
-                raise SpecError(
-                    f"{source} has the equation {equation!r}, which is not one of x' = A x + B u and y = C x + D u: "
-                    "the matrices alone do not say what it means.",
-                    path=str(source),
-                )
-
-
-def _matrix(body: str, rows: int, columns: int, name: str, source: Path) -> FloatArray:
-    if body.startswith("zeros"):
-        return np.zeros((rows, columns))
-    lines = [line for line in body.strip("[]").split(";") if line.strip()]
-    values = [[_number(entry, name, source) for entry in line.split(",")] for line in lines]
-    if len(values) != rows or any(len(row) != columns for row in values):
-        raise SpecError(f"{source}: {name} is not {rows} by {columns}, as the file states.", path=name)
-    return np.array(values).reshape(rows, columns)
-
-
-def _numbers(body: str, count: int, name: str, source: Path) -> list[float]:
-    if not body.startswith("{"):
-        return [0.0] * count
-    entries = [entry for entry in body.strip("{}").split(",") if entry.strip()]
-    if len(entries) != count:
-        raise SpecError(f"{source}: {name} has {len(entries)} entries, but {count} are needed.", path=name)
-    return [_number(entry, name, source) for entry in entries]
-
-
-def _number(text: str, name: str, source: Path) -> float:
-    try:
-        return number_in_text(text)
-    except ValueError:
-        raise SpecError(f"{source}: {name} holds {text.strip()!r}, which is no number.", path=name) from None
