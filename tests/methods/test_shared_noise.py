@@ -46,6 +46,37 @@ def test_the_steady_covariance_is_that_of_the_riccati_equation_with_a_cross_term
     np.testing.assert_allclose(steady_covariance(design), filtered_covariance(plant), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", [4, 26, 35])
+def test_outputs_of_fewer_noises_leave_no_rounding_in_the_filter(seed: int) -> None:
+    """Three outputs of two noises tell four states exactly after some samples: nothing is left that has a covariance,
+    and innovations are whitened by what noise there is."""
+    rng = np.random.default_rng([4646, seed])
+    A = rng.standard_normal((4, 4))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    C, Bw, Dw = (rng.standard_normal(shape) for shape in ((3, 4), (4, 2), (3, 2)))
+    design = obsynth.descriptor_kalman(obsynth.DescriptorSystem(A=A, C=C, Bw=Bw, Dw=Dw, dt=1.0))
+    assert design.report.passed
+    x, outputs = rng.standard_normal(4), []
+    for w in rng.standard_normal((20, 2)):
+        outputs.append(C @ x + Dw @ w)
+        last, x = x, A @ x + Bw @ w
+    run = design.observer.run(np.array(outputs))
+    assert not np.any(run.state_covariances[-1])
+    np.testing.assert_allclose(run.states[-1, :4], last, rtol=1e-7, atol=1e-7)
+
+
+def test_more_noises_than_outputs_leave_no_rounding_in_the_plant() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.99]], C=[[-1.4], [-0.2], [-1.0]], Bw=[[0.3, -1.7, -0.3, 0.3]],
+        Dw=[[0.1, -1.4, 1.2, 0.6], [-0.4, -2.2, -0.4, -0.8], [-0.1, -1.1, 0.7, 0.5]], dt=1.0,
+    )  # fmt: skip
+    design = obsynth.descriptor_kalman(plant)
+    assert design.report.passed
+    for matrix in (design.plant.A.at(0), design.plant.C.at(1)):
+        entries = np.abs(matrix[matrix != 0.0])
+        assert np.all(entries > 1e-9)
+
+
 def test_outputs_that_act_on_the_plant_change_nothing() -> None:
     # With x+ = A x + w + G y, and y measured, the errors of the filter are those of G = 0.
     for seed in range(3):

@@ -201,8 +201,8 @@ def rank_revealing_step(
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``.
 
-    The factor has no more columns that are not zero than noise has directions beside those of the parity: where none is
-    left, x is known exactly, and its covariance is zero without rounding.
+    The factor has no more columns that are not zero than noise has independent directions beside those of the parity:
+    where none is left, x is known exactly, and its covariance is zero without rounding.
 
     Then combinations of the data vanish, and any multiple of them may be added to x: stated noise does not choose.
     With ``rounding`` that multiple is taken by which the least of it remains; without, none, and errors that rounding
@@ -219,6 +219,7 @@ def rank_revealing_step(
         # Of an equation 0 = 0 rounding would make one of the others, with noise of that size.
         _require_vanishing(Y[~says, mapped:columns], sizes[~says, mapped:], mapped)
         H, S, Y, sizes, unknown = (part[says] for part in (H, S, Y, sizes, unknown))
+    S = _independent_noise(S)
     lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
     rank = len(head)
     innovation, carried, noise_left, vanishing = _whitened(q1, q2, S, Y, sizes[:, mapped:], mapped)
@@ -234,6 +235,24 @@ def rank_revealing_step(
         return LeastSquaresStep(estimate[:, :columns], factor, innovation, diffuse, np.zeros((n, 0)))
     chosen, remaining = _least_rounding(estimate, vanishing, columns, rounding)
     return LeastSquaresStep(chosen, factor, innovation, diffuse, remaining)
+
+
+def _independent_noise(S: FloatArray) -> FloatArray:
+    """Return a root of the covariance of ``S (rows, any)`` with no more columns than it has independent directions.
+
+    Columns that depend on the others would leave as many of rounding in what comes after, and a later step, in which
+    nothing else is left, would take these for noise."""
+    if not S.size:
+        return S
+    sizes = np.linalg.norm(S, axis=1, keepdims=True)
+    sizes[sizes == 0.0] = 1.0
+    _, triangle, order = _pivoted((S / sizes).T)
+    rank = int(np.sum(np.abs(np.diagonal(triangle)) > PERFECT_PARITY))
+    if rank == S.shape[1]:
+        return S
+    compact = np.empty((len(S), rank))
+    compact[order] = triangle[:rank].T
+    return np.asarray(compact * sizes)
 
 
 def _square(root: FloatArray) -> FloatArray:

@@ -62,8 +62,9 @@ def _noise_as_states(plant: DescriptorSystem) -> SharedNoise:
     count = outputs.shape[1]
     if count > plant.ny:
         # The outputs show as many combinations as there are outputs; the others drive equations alone.
-        turned = np.linalg.qr(outputs.T, mode="complete")[0]
-        equations, outputs = equations @ turned, outputs @ turned[:, : plant.ny]
+        turned, triangle = np.linalg.qr(outputs.T, mode="complete")
+        # Rounding of zeros would have units of its own, far from those of all else.
+        equations, outputs = product_but_rounding(equations, turned), triangle[: plant.ny].T
         count = plant.ny
     rest = np.hstack([plant.Bw[:, ~both], equations[:, count:]])
     alone = np.hstack([plant.Dw[:, ~both], np.zeros((plant.ny, equations.shape[1] - count))])
