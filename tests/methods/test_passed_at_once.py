@@ -7,7 +7,13 @@ import pytest
 
 import obsynth
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.passed_at_once import _answer, _shown_at_once, without_white_noise
+from obsynth.methods.optimal_filter.passed_at_once import (
+    _answer,
+    _shown_at_once,
+    with_digits_of,
+    without_white_noise,
+)
+from obsynth.methods.optimal_filter.realisation import Followed
 
 NX, STILL = 4, 2
 
@@ -45,3 +51,27 @@ def test_filters_of_index_zero_pass_no_white_noise_either() -> None:
     shown = np.hstack(_shown_at_once(plant))
     assert np.abs(corrected @ shown).max() == 0.0
     assert corrected[0, 1] == 3.0
+
+
+def test_of_index_two_d_and_t0_pass_no_white_noise_but_by_rounding() -> None:
+    """Rows whose parts by D and by T0 cancel keep their digits; those of rounding alone are zero."""
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 1.0, 0.0], k=1)[:3, :3], A=np.diag([-1.0, 1.0, 1.0]), Bf=np.zeros((3, 1)), C=np.eye(2, 3),
+        Bw=[[0.0, 0.0], [0.0, 0.0], [2.0, 0.0]], Dw=[[3.0, 0.0], [0.0, 5.0]], dt=0.0,
+    )  # fmt: skip
+    # T0 E = 0 leaves of T0 the last equation: 0.7 3 - 1.05 2 = 0.
+    t0 = np.array([[0.0, 0.0, 1.05], [0.0, 0.0, 1e-13]])
+    stated = Followed(
+        *(np.zeros(shape) for shape in ((0, 0), (0, 2), (2, 0))),
+        D=np.array([[0.7 * (1.0 + 1e-11), 1e-12], [0.0, 1e-12]]),
+        T=np.zeros((0, 3)),
+        T0=t0,
+        lag=0,
+    )
+    models = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), np.zeros((2, 1))
+    follower = with_digits_of(plant, FaultMap(None, models, exact=False), stated)
+    assert np.abs(follower.D @ plant.Dw - follower.T0 @ plant.Bw).max() < 1e-15
+    assert follower.D[0, 0] == pytest.approx(0.7, rel=1e-10)
+    assert not follower.D[1].any()
+    assert not follower.T0[1].any()
+    assert follower.D[0, 1] == 0.0

@@ -10,23 +10,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.decoupling_windows import EstimationProblem, Model
+from obsynth.numerics.decoupling_windows import NEAR_INFINITY, EstimationProblem, Model
 from obsynth.numerics.least_estimation import STABLE_RADIUS, UNSTABLE_ZERO
-from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati
+from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati, discrete_solution
 from obsynth.numerics.ranks import ROUNDED_ZERO, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import uncayley
 
-#: Modes of the Cayley transform nearer to -1 are infinite ones: of plants whose index is 2 or more.
+#: Modes of the Cayley transform nearer to -1 are infinite ones.
 INFINITE_MODE = 1e-10
-#: Those of index 3 or more are multiple ones, of this much times the root of the precision that their number sets: of
-#: 24 random plants of index 3 the farthest was a tenth of it off.
+#: Multiple ones are farther from it, this much times the root of the precision that their number sets: of 24 random
+#: plants of index 3 the farthest was a tenth of it off.
 MOVED_MODES = 1e3
 #: White noise that passes to the error by less than this share is rounding.
 WHITE_SHARE = 1e-9
@@ -132,22 +133,14 @@ class _Split(NamedTuple):
     known: FloatArray
 
 
-def least_mean_square(
-    problem: EstimationProblem, *, noises: Sequence[float] = (0.0,), index: int = 1
-) -> ContinuousFilter:
+def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (0.0,)) -> ContinuousFilter:
     """Return the continuous-time filter of least mean square: the Cayley transform of the problem keeps no H2 norm.
 
-    The first of ``noises`` is added to every output; where it is zero, as much as the problem needs.  ``index`` is that
-    of the plant: the higher it is, the farther rounding moves infinite modes.
+    The first of ``noises`` is added to every output; where it is zero, as much as the problem needs.
 
     Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
     """
-    near = INFINITE_MODE if index <= 2 else MOVED_MODES * float(np.finfo(float).eps) ** (1.0 / (index - 1))
-    if np.min(np.abs(1.0 + np.linalg.eigvals(problem.A)), initial=np.inf) < near:
-        raise PreconditionError(
-            "The outputs show derivatives of noise or of faults, and white noise has none. Give norm hinf.",
-            condition="zeros",
-        )
+    problem = _without_derivatives(problem)
     rows = len(problem.C)
     a, b, outputs, direct = uncayley(
         problem.A,
@@ -183,6 +176,38 @@ def least_mean_square(
         least = _least(measured, error_rows) if added else deviation
         return ContinuousFilter(filter_, deviation, least, added)
     return _of_the_rest(split, measured, (moved, residual, estimate), (Z0 @ split.noisy, wanted), added)
+
+
+def _without_derivatives(problem: EstimationProblem) -> EstimationProblem:
+    """Return the same problem where outputs show derivatives of white noise: each is read by a lag, as any filter with
+    a finite mean square reads it.
+
+    Derivatives are modes at -1 of the Cayley transform.  ``chi+ = A chi + G Y + K r`` with a K that moves these alone
+    leaves out no filter that reads what is left: r passes a stable filter whose zeros are the modes that were moved.
+    """
+    a, size = problem.A, len(problem.A)
+    count = int(np.sum(np.abs(1.0 + np.linalg.eigvals(a)) < NEAR_INFINITY))
+    near = min(max(INFINITE_MODE, MOVED_MODES * float(np.finfo(float).eps) ** (1.0 / max(count, 1))), NEAR_INFINITY)
+
+    def infinite(x: Any, y: Any = 0.0) -> Any:
+        return np.hypot(x + 1.0, y) < near
+
+    schur, vectors, count = scipy.linalg.schur(a, output="real", sort=infinite) if size else (a, a, 0)
+    if not count:
+        return problem
+    modes, own = schur[:count, :count], vectors[:, :count]
+    rows = problem.C @ own
+    shown = float(np.linalg.norm(rows)) or 1.0
+    solution = discrete_solution(modes, rows / shown, np.eye(count), np.eye(len(rows))) if len(rows) else None
+    if solution is None:
+        raise PreconditionError(
+            "The error shows derivatives of noise or of faults whatever the filter, and white noise has none. Give a "
+            "reference model of higher order, or norm hinf.",
+            condition="finite mean square",
+        )
+    moved = np.linalg.solve(rows @ solution @ rows.T / shown**2 + np.eye(len(rows)), rows @ solution @ modes.T / shown)
+    gain = own @ moved.T / shown
+    return replace(problem, A=a - gain @ problem.C, B=problem.B - gain @ problem.D, G=problem.G + gain @ problem.V)
 
 
 def _of_the_rest(

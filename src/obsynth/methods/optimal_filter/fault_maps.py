@@ -170,7 +170,7 @@ def _finite_mean_square(plant: DescriptorSystem, options: Options) -> Condition:
     claim, holds, detail, of_ours = "some filter has a finite mean square, by a Riccati equation", True, "", False
     try:
         try:
-            least_mean_square(first_problem(plant, options)[1], index=structure_of(plant).index or 0)
+            least_mean_square(first_problem(plant, options)[1])
         except PreconditionError:
             if with_lasting_modes_driven(plant) is plant:
                 raise
@@ -206,8 +206,13 @@ def first_problem(plant: DescriptorSystem, options: Options) -> tuple[FaultMap, 
             if fault_map.exact:
                 require_vanishing(plant, reference=fault_map.reference, delays=fault_map.delays)
             require_stable_filter(problem)
+            if options.reference is None and options.norm == "h2" and not plant.is_discrete:
+                least_mean_square(problem)
         except PreconditionError as error:
             last = error
+            # A lag of higher order passes less.
+            if error.condition == "finite mean square":
+                continue
             # None depends on the delay, nor the last on how many lags there are.
             if error.condition == "fault map" or (error.condition in ("decoupling", "zeros") and plant.is_discrete):
                 break
@@ -337,7 +342,7 @@ def designed(
         size = min(size, _reference_gain(plant, fault_map, problem.alpha) / ratio)
     try:
         if norm == "h2" and not plant.is_discrete:
-            continuous = least_mean_square(problem, noises=noises, index=structure_of(plant).index or 0)
+            continuous = least_mean_square(problem, noises=noises)
             filter_, gain = continuous.filter, continuous.deviation
             nothing = filter_[0]
             least = LeastEstimation(nothing, nothing, gain, 0.0, 0.0, continuous.added_noise, ())

@@ -42,8 +42,8 @@ class OptimalFilterMethod(Method):
     reference : mapping, sequence of matrices or control system, optional
         What the estimate shall be of the faults: ``{"bandwidth": 10}`` in rad/s (a lag for each fault, of ``"order"``
         1), or ``A, B, C, D`` of a stable model with nf inputs, as a mapping, in this order, or as a system of
-        python-control.  In continuous time the default is the lag of least order that has an exact fault map, as fast
-        as the plant's own poles that its outputs show.
+        python-control.  In continuous time the default is the lag of least order that has an exact fault map (with
+        ``norm="h2"`` also a finite mean square), as fast as the plant's own poles that its outputs show.
     norm : {"hinf", "h2"}, optional
         Least largest gain (of energies), or least mean square for white noise of unit intensity.
     exact : bool, optional

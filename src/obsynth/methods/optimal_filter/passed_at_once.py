@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.realisation import Followed
+from obsynth.methods.optimal_filter.realisation import Followed, left_kernel_of
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
@@ -61,13 +61,57 @@ def _shown_at_once(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, Flo
     return faults, disturbances, noise
 
 
-def with_digits_of(plant: DescriptorSystem, follower: Followed) -> Followed:
-    """Return a filter with the T0 that follows from what it passes at once; ``plant``: of any index."""
-    if follower.lag or structure_of(plant).index != 1:
+def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
+    """Return a filter that passes no white noise at once but by rounding, with the T0 that follows.
+
+    ``plant``: continuous, of any index, with the disturbances that are decoupled.
+    """
+    index = structure_of(plant).index
+    if follower.lag or index == 0:
         return follower
+    if index != 1:
+        return _without_rounding_passed(plant, fault_map, follower)
     answer = _answer(plant)
-    t0, terms = follower.D @ plant.C @ answer, np.abs(follower.D) @ np.abs(plant.C) @ np.abs(answer)
-    return follower._replace(T0=np.where(np.abs(t0) > CANCELLATION_TOLERANCE * terms, t0, 0.0))
+    return follower._replace(T0=_product(follower.D, plant.C, answer))
+
+
+def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
+    """Return a filter whose D and T0, changed by rounding of each entry, pass at once what the fault map passes.
+
+    Of an index of 2 or more what passes by the states hangs on T, too: ``D Dw - T0 Bw`` is what is stored of it.
+    """
+    kernel = left_kernel_of(plant.E)
+    weights, reference, none = fault_map.weights, fault_map.reference, np.zeros((len(follower.D), plant.nd))
+    of_noise = None if weights is None or weights.noise is None else weights.noise[3]
+    of_faults = None if weights is None or fault_map.exact else weights.faults
+    ways = [(plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw)]
+    faults, disturbances, noise = (np.vstack([through, -_product(kernel, driven)]) for driven, through in ways)
+    models = [model for model in (of_faults, reference) if model is not None]
+    passed = reduce(in_series, models)[3]
+    faults = faults if of_faults is None else faults @ of_faults[3]
+    noise = noise if of_noise is None else noise @ of_noise
+    noise = noise[:, : noise.shape[1] - fault_map.undriven]
+    shown = np.hstack([faults, disturbances, noise])
+    wanted = np.hstack([passed, none, np.zeros((len(passed), noise.shape[1]))])
+    rows = np.hstack([follower.D, follower.T0[:, : plant.nx] @ np.linalg.pinv(kernel)])
+    for i, row in enumerate(rows):
+        # What passes of an input is rounding beside its own terms, as it is verified.
+        entries = np.abs(row)
+        terms = entries[:, None] * shown
+        sizes = np.linalg.norm(terms, axis=0)
+        sizes = np.where(sizes > 0.0, sizes, 1.0)
+        inverse = np.linalg.pinv(terms / sizes, rcond=RANK_TOLERANCE)
+        for _ in range(CORRECTIONS):
+            row = row - (((row @ shown - wanted[i]) / sizes) @ inverse) * entries
+        # Of what was nothing but rounding nothing is left.
+        rows[i] = np.where(np.abs(row) > ROUNDED_SHARE * entries, row, 0.0)
+    return follower._replace(D=rows[:, : plant.ny], T0=rows[:, plant.ny :] @ kernel)
+
+
+def _product(*factors: FloatArray) -> FloatArray:
+    """Return a product without entries that are rounding of its terms."""
+    entries, terms = reduce(np.matmul, factors), reduce(np.matmul, [np.abs(factor) for factor in factors])
+    return np.where(np.abs(entries) > CANCELLATION_TOLERANCE * terms, entries, 0.0)
 
 
 def _answer(plant: DescriptorSystem) -> FloatArray:

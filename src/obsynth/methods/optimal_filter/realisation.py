@@ -244,7 +244,7 @@ def _followed(
     e, own, _, dd_past = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
     bd = np.vstack([plant.Bd, np.zeros((na - plant.nx, plant.nd))])
-    left_kernel = _left_kernel(e)
+    left_kernel = left_kernel_of(e)
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
     # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
     sizes = [nz * na, nz * count, rows * len(left_kernel), rows * count]
@@ -368,7 +368,7 @@ def _shows_a_disturbance(
     return bool(np.any(largest > DISTURBANCE_LEFT * size))
 
 
-def _left_kernel(e: FloatArray) -> FloatArray:
+def left_kernel_of(e: FloatArray) -> FloatArray:
     """Return rows N with ``N E = 0``: exactly, where equations of E are empty."""
     empty = ~e.any(axis=1)
     units = np.eye(len(e))[empty]

@@ -376,7 +376,7 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
     if white:
         ways = without_white_noise(plant, fault_map, ways)
     follower = followed(plant, ways, problem.window + problem.shift)
-    follower = with_digits_of(plant, follower) if white else follower
+    follower = with_digits_of(plant, fault_map, follower) if white else follower
     rows = len(follower.C)
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
