@@ -187,6 +187,9 @@ def test_outputs_that_show_second_derivatives_of_white_noise_have_the_least_mean
     assert own["deviation"] == pytest.approx(own["least_deviation"], rel=1e-6)
     assert own["least_deviation"] == pytest.approx(behind["least_deviation"], rel=1e-7)
     assert own["least_deviation"] < 0.9 * np.sqrt(0.75)  # that of the estimate zero
+    twice = obsynth.optimal_filter(lagged(lagged(plant)), norm="h2", exact=False, reference=reference)
+    assert own["least_deviation"] == pytest.approx(twice.least, rel=1e-7)
+    assert twice.gain < 1.01 * twice.least
 
 
 def of_index_two(seed: int, count: int) -> obsynth.DescriptorSystem:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 import obsynth
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.index_reduction import reduced_index
 
 
@@ -249,3 +251,37 @@ def test_a_refusal_of_a_reduced_plant_names_what_was_left_out_and_states_as_writ
         Dw=np.zeros((3, 0)), output_names=["y1", "y2", "x1 measured"],
     )  # fmt: skip
     assert obsynth.design(measured, method).report.passed
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_computed_numbers_leave_no_rounding_between_states_that_are_not_linked(seed: int) -> None:
+    """Two lags in series of each output drive nothing: the units of the reduced plant were those of rounding, 2^52."""
+    rng = np.random.default_rng([47, seed])
+    n, ny = 3, 2
+    modes = rng.standard_normal((n, n)) - 3.0 * np.eye(n)
+    e0, a0 = block_diag(np.eye(n), np.eye(3, k=1)), block_diag(modes, np.eye(3))
+    left, right = rng.standard_normal((2, n + 3, n + 3))
+    none, lag = np.zeros((ny, ny)), -np.eye(ny)
+    states = np.zeros((n + 3, ny))
+    plant = obsynth.DescriptorSystem(
+        E=block_diag(left @ e0 @ right, np.eye(2 * ny)),
+        A=np.block(
+            [
+                [left @ a0 @ right, states, states],
+                [rng.standard_normal((ny, n + 3)), lag, none],
+                [states.T, -lag, lag],
+            ]
+        ),
+        C=np.hstack([states.T, none, np.eye(ny)]),
+        Bf=np.vstack([rng.standard_normal((n + 3, 1)), np.zeros((2 * ny, 1))]),
+        dt=0.0,
+    )
+    reduced = reduced_index(plant).plant
+    for s in (0.4j, 3.0j):
+        assert transfer(reduced, s, "f") == pytest.approx(transfer(plant, s, "f"), rel=1e-9)
+    first, second = reduced.A[-2 * ny : -ny], reduced.A[-ny:]
+    assert not first[:, -ny:].any()
+    assert not second[:, : -2 * ny].any()
+    assert not reduced.A[: -2 * ny, -2 * ny :].any()
+    units = PlantUnits.of(reduced)
+    assert units.spread < 1e3

@@ -26,7 +26,7 @@ from flint import fmpq, fmpq_mat
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.input_derivatives import MOST_DERIVATIVES, derivative_name, derivative_of
@@ -241,8 +241,13 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     j, n = inner[:count, :count], inner[count:, count:]
     g = np.linalg.inv(np.eye(plant.nx - count) - shift * n)
     algebraic = g @ constrained
-    own = shift * np.eye(count) - np.linalg.inv(j)
-    b = np.linalg.solve(j, driven[:count])
+    inverse_j = np.linalg.inv(j)
+    # Rounding in place of zeros would link states that are not linked: the units of the reduced plant would follow it.
+    sizes = np.abs(np.linalg.inv(basis)) @ np.abs(moved) @ np.abs(basis)
+    sizes = np.abs(inverse_j) @ sizes[:count, :count] @ np.abs(inverse_j)
+    own = but_rounding(shift * np.eye(count) - inverse_j, np.max(sizes, initial=0.0))
+    entered = np.abs(inverse_j) @ terms[:count] + sizes @ terms[:count]
+    b = but_rounding(inverse_j @ driven[:count], np.max(entered, axis=0, initial=0.0))
     states = _but_small(nilpotent @ algebraic, np.abs(nilpotent) @ np.abs(g) @ np.abs(constrained))
     # Entries of n that are zero were rounded beside its largest one.
     coupled = np.abs(g @ n) + np.max(np.abs(g @ n), initial=0.0)
