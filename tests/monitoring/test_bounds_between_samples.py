@@ -351,3 +351,15 @@ def test_known_inputs_that_move_between_samples_are_in_the_threshold(kind: str):
     assert 0.9 < ratio.max() <= 1.0
     # Disturbances alone are far from it.
     assert table["statistic"].max() > 5.0 * watched.rule.limit
+
+
+def test_a_disturbance_of_size_zero_has_no_effect_even_where_another_has_no_bound():
+    """What does not decay makes the effect of a disturbance infinite, and that of none is zero, not undefined."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 1.0], [0.0, -1.0]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1.0], [0.0]], disturbance_names=["load"]
+    )
+    scenario = obsynth.Scenario(horizon=5, sample_time=0.1)
+    assert obsynth.monitor(obsynth.pd_observer(plant, decay=1.0), scenario).threshold[-1] < 1e-300
+    # Nothing but rounding would pass such a threshold on a log.
+    with pytest.raises(SpecError, match="no disturbance and no noise reaches the residual"):
+        obsynth.online_monitor(obsynth.ui_pi_observer(plant), disturbance_bounds={"load": 0.0}, sample_time=0.1)

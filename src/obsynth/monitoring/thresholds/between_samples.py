@@ -159,7 +159,9 @@ class IntersampleErrorSystem:
         at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(plant.Dd) + Ball.exact(self.c) @ Ball.exact(now))
         by_later, by_all = self._sums(self.M @ Ball.exact(now) + later, steps)
         table = gathered(pieces, partial, count)[: max(steps - 1, 0)] + by_later[: max(steps - 1, 0)]
-        for_ever = rounded_up((gathered(pieces, for_ever, count) + by_all + at_once) * sizes, 6)
+        per_unit = gathered(pieces, for_ever, count) + by_all + at_once
+        # A disturbance that is zero does nothing, even where one that is not has no bound.
+        for_ever = rounded_up(np.multiply(per_unit, sizes, out=np.zeros(count), where=sizes > 0.0), 6)
         earlier = np.vstack([np.zeros((1, count)), table])[:steps]
         return np.asarray(rounded_up(np.sum((earlier + at_once) * sizes, axis=1), count + 6)), np.asarray(for_ever)
 

@@ -32,7 +32,7 @@ from obsynth.monitoring.thresholds.residual_norm_bounds import (
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.suggestions import suggestion
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -341,7 +341,8 @@ def _require_above(kind: str, limit: float, errors: ErrorModel, C: FloatArray, b
     # They come by the states, of which a row may show others than those that they enter.
     into_error = np.abs(errors.own) @ np.abs(errors.plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
     size = float(np.linalg.norm(C, 2) * np.linalg.norm(into_error))
-    if not limit > RESIDUAL_ROUNDING_SHARE * size:
+    # Of nothing at all, what is left is what zero is rounded up to.
+    if not limit > max(RESIDUAL_ROUNDING_SHARE * size, SMALLEST):
         raise SpecError(
             "As stated, no disturbance reaches the residual, and (66) bounds nothing else: use pointwise, which bounds "
             "noise too, or give a threshold yourself (thresholds)."
