@@ -581,3 +581,31 @@ def test_a_kalman_filter_decides_when_the_error_of_its_start_is_gone() -> None:
     unknown = obsynth.TimeVaryingDescriptorSystem(**matrices, Phi=[[1.0]])
     design = obsynth.adaptive_observer(unknown, Q=1e-4, R=1e-2, forgetting=0.95)
     assert settling_rows(design) == SETTLING
+
+
+@pytest.mark.long
+def test_a_slow_estimate_after_a_warm_up_is_no_jump() -> None:
+    """Rows after a warm-up were predicted from the mean: a slow estimate came as a jump, and the normal log of the oven
+    was in alarm for 200 rows with its own thresholds."""
+    plant = obsynth.load_spec(Path("docs/examples/thermal/spec.yaml")).plant
+    design = obsynth.ui_pi_observer(plant)
+    point = np.array([plant.operating_point[name] for name in (*plant.input_names, *plant.output_names)])
+
+    def log(seed: int, lost: float = 0.0) -> pd.DataFrame:
+        rng, x, rows = np.random.default_rng(seed), np.zeros(plant.nx), []
+        for k in range(360):
+            d = 4.0 * np.sin(2.0 * np.pi * k / 720.0)
+            rows.append([10.0 * k, *(point + np.concatenate([[0.0], plant.C @ x + 0.1 * rng.standard_normal(3)]))])
+            x = np.linalg.solve(plant.E, plant.A @ x + plant.Bd[:, 0] * d + plant.Bf[:, 0] * lost * (k >= 300))
+        return pd.DataFrame(rows, columns=["time", *plant.input_names, *plant.output_names])
+
+    learned = obsynth.learn_thresholds(design, log(0), false_alarms="1 per 100 rows")
+    assert "fhat[heater fault]" in learned.columns
+    monitor = obsynth.online_monitor(design, "learned", normal=learned)
+    for seed in range(3):
+        run = obsynth.run_on_data(design, log(seed), monitor=monitor)
+        assert run.table["status"].iloc[0] == "warm-up"
+        assert run.table["alarm"].ne("").mean() < 0.05
+    alarms = obsynth.run_on_data(design, log(3, lost=30.0), monitor=monitor).table["alarm"].ne("").to_numpy()
+    assert not alarms[:300].any()
+    assert alarms[300:310].any()

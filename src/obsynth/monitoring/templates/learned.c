@@ -437,7 +437,8 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         m->to_wait = ORDER + 1;
     }
     m->to_wait -= m->to_wait > 0;
-    is_said = is_whole || (innovation >= 0 && (is_said || known));
+    /* What follows a warm-up is predicted from its last rows. */
+    is_said = is_whole || ((innovation >= 0 || !deciding) && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
     if (deciding && m->taken > MONITOR_SETTLING) {

@@ -66,9 +66,10 @@ def follow_shares(memory: float) -> tuple[float, float]:
 
 
 class LearnedRule(Rule):
-    """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
-    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.  Where the gain follows
-    what is measured, a sample whose outputs say nothing by themselves is decided so, too.
+    """The largest of all statistics in units of its level, row by row.  A row that is missing is as the autoregression
+    predicts it, and one in which nothing may be decided is only what the next ones are predicted from: neither adds
+    evidence, or takes any away.  Where the gain follows what is measured, a sample whose outputs say nothing by
+    themselves is decided so, too.
 
     Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
     moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
@@ -148,16 +149,17 @@ class LearnedRule(Rule):
         if not complete and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
+        # What follows a warm-up is predicted from its last rows: from the mean, a slow estimate would come as a jump.
+        kept = varying or not sample.deciding
         if values_of_row is None or not (
-            complete or (varying and (counts or np.isfinite(values_of_row[self._places]).all()))
+            complete or (kept and (counts or np.isfinite(values_of_row[self._places]).all()))
         ):
             state = self._followed(self._added(state, None), sample.observation)
         else:
             watched = values_of_row[self._places]
             filled = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
-            state = self._followed(
-                self._added(state, filled, most, evidence), sample.observation, np.isfinite(watched), counts=counts
-            )
+            seen = np.isfinite(watched) if complete or varying else None
+            state = self._followed(self._added(state, filled, most, evidence), sample.observation, seen, counts=counts)
         # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
         # stands is not ended by outputs that are left out.
         by_rows_before = varying and sample.deciding and state.taken > self.learned.settling
