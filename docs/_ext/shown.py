@@ -1,8 +1,8 @@
 """Directives that run what a page shows and put the real output below it; a build ends where one of them fails.
 
 ``{shown}`` runs commands, one a line, and ``{shown-python}`` code, both in a folder that a page has for itself, so that what
-one writes the next one reads.  ``:files:`` copies files of the documentation into that folder first, and
-``{shown-file}`` writes one that stands on the page.  With ``:root:`` code runs in the folder of the repository, which it only reads.
+one writes the next one reads.  ``:files:`` copies files of the repository into that folder first, which a line
+above the block says; ``{shown-file}`` writes one that stands on the page.  With ``:root:`` code runs in the folder of the repository, which it only reads.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Shown(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Return a block for each command and one for its output."""
         folder = _folder(self)
-        found: list[nodes.Node] = []
+        found: list[nodes.Node] = _files_needed(self)
         waiting: list[str] = []
         began = time.monotonic()
         for line in "\n".join(self.content).replace("\\\n", " ").splitlines():
@@ -112,7 +112,7 @@ class ShownPython(SphinxDirective):
             text = f"{self.env.docname}, line {self.lineno}\n{traceback.format_exc()}"
             raise ExtensionError(text) from None
         _tell(self, began)
-        shown = [_block(code, "python")]
+        shown = [*_files_needed(self), _block(code, "python")]
         if output.getvalue().strip() and "silent" not in self.options:
             shown.append(_output(output.getvalue().rstrip()))
         return shown
@@ -142,16 +142,40 @@ def _folder(directive: SphinxDirective) -> Path:
     if name not in _FOLDERS:
         _FOLDERS[name] = Path(tempfile.mkdtemp(prefix="shown-"))
     folder = _FOLDERS[name]
-    source = Path(directive.env.srcdir)
-    for pattern in directive.options.get("files", "").split():
-        files = sorted(source.glob(pattern)) or sorted(source.parent.glob(pattern))
-        if not files:
-            raise ExtensionError(f"{name}, line {directive.lineno}: there is no file {pattern}")
-        for path in files:
-            directive.env.note_dependency(str(path))
-            if path.is_file():
-                shutil.copy(path, folder / path.name)
+    for path in _files(directive):
+        directive.env.note_dependency(str(path))
+        shutil.copy(path, folder / path.name)
     return folder
+
+
+def _files(directive: SphinxDirective) -> list[Path]:
+    """Return the files that a block asks for."""
+    source, found = Path(directive.env.srcdir), []
+    for pattern in directive.options.get("files", "").split():
+        files = [path for path in sorted(source.glob(pattern)) or sorted(source.parent.glob(pattern)) if path.is_file()]
+        if not files:
+            raise ExtensionError(f"{directive.env.docname}, line {directive.lineno}: there is no file {pattern}")
+        found += files
+    return found
+
+
+def _files_needed(directive: SphinxDirective) -> list[nodes.Node]:
+    """Return a line that says which files of the repository a reader needs in his folder; none without files."""
+    if "root" in directive.options:
+        text = "In the folder of the repository:"
+        return [nodes.paragraph(text, text, classes=["shown-files"])]
+    names: dict[str, list[str]] = {}
+    for path in _files(directive):
+        names.setdefault(str(path.parent.relative_to(Path(directive.env.srcdir).parent)), []).append(path.name)
+    if not names:
+        return []
+    line = nodes.paragraph("", "", nodes.Text("With "), classes=["shown-files"])
+    for i, (folder, files) in enumerate(names.items()):
+        for j, name in enumerate(files):
+            line += [nodes.Text(", " if i or j else ""), nodes.literal(name, name)]
+        line += [nodes.Text(" from "), nodes.literal(folder, folder)]
+    line += nodes.Text(" of the repository, copied into a folder of your own:")
+    return [line]
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import re
 import runpy
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -35,7 +36,9 @@ def test_the_first_steps_lead_to_a_plotted_alarm(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.one_in(4)
-@pytest.mark.parametrize("page", ["motor", "tank", "circuit", "time_varying", "smoothing", "conditions", "region"])
+@pytest.mark.parametrize(
+    "page", ["motor", "tank", "circuit", "mechanism", "time_varying", "smoothing", "conditions", "region"]
+)
 def test_the_code_of_the_how_tos_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
@@ -128,3 +131,19 @@ def test_a_spec_of_a_how_to_is_designed_and_simulated(example, tmp_path, monkeyp
     assert not [text for text in run.warnings if "begins" in text]
     assert run.table[f"fhat[{fault}]"].iloc[-1] == pytest.approx(size, rel=0.05)
     assert "examples/" + example in "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("howto/*.md"))
+
+
+def test_a_block_says_which_files_it_needs(monkeypatch):
+    """Commands on a page ran in a folder with files of which the page said nothing."""
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    import shown
+
+    env = SimpleNamespace(srcdir=str(DOCS), docname="howto/tuning")
+    options = {"files": "examples/thermal/* designs/drive/plant.yaml"}
+    (line,) = shown._files_needed(SimpleNamespace(env=env, options=options, lineno=1))
+    assert line.astext() == (
+        "With make_log.py, spec.yaml from docs/examples/thermal, plant.yaml from designs/drive of the repository, "
+        "copied into a folder of your own:"
+    )
+    assert not shown._files_needed(SimpleNamespace(env=env, options={}, lineno=1))
