@@ -30,6 +30,53 @@ def test_a_constant_that_is_added_to_an_estimate_fails(method: str) -> None:
     assert "error model" in {row.name for row in report.failures}
 
 
+CONSTRAINED = obsynth.DescriptorSystem(
+    E=np.diag([1.0, 1.0, 0.0]), A=[[-0.8, 0.1, 0.3], [0.0, -0.7, 0.2], [1.0, 0.4, -1.0]],
+    B=[[1.0], [0.5], [0.2]], C=[[1.0, 0.0, 0.3], [0.0, 1.0, 1.0]], Bf=[[1.0], [0.0], [0.0]],
+    Bw=0.1 * np.eye(3, 5)[:, [0, 1, 4, 2, 3]] * [[1.0], [1.0], [0.0]],
+    Dw=0.1 * np.eye(2, 5, k=3), operating_point={"x3": 2.0}, dt=0.0,
+)  # fmt: skip
+
+
+def _changed(matrix: np.ndarray, place: tuple[int, int], value: float) -> np.ndarray:
+    changed = matrix.copy()
+    changed[place] = value
+    return changed
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+@pytest.mark.parametrize("field", ["names", "from_state", "both", "from_noise", "noise_kept", "operating_point"])
+def test_states_as_written_are_recovered_under_their_names(field: str, sampled: bool) -> None:
+    """A state under another name, ten times as large, or about another point, was verified."""
+    if sampled:
+        design = obsynth.ui_pi_observer(obsynth.discretise(CONSTRAINED, 0.1))
+    else:
+        design = obsynth.functional_filter(obsynth.eliminate_algebraic_states(CONSTRAINED))
+    known = design.recovery
+    assert obsynth.verify(design).passed
+    assert "recovery as written" in {row.name for row in design.report.checks}
+    other = {
+        "names": ("x1", "x2", "level"),
+        "from_state": _changed(known.from_state, (2, 0), 10.0),
+        "from_noise": _changed(known.from_noise, (2, 1), 0.1),
+        "noise_kept": _changed(known.noise_kept, (0, 0), 0.5),
+        "operating_point": {"x3": 5.0},
+    }
+    fields = ("names", "from_state") if field == "both" else (field,)
+    changed = replace(design, recovery=replace(known, **{name: other[name] for name in fields}), report=None)
+    expected = "stored twice" if "noise" in field else "recovery as written"
+    assert {row.name for row in obsynth.verify(changed).failures} == {expected}
+
+
+def test_states_that_a_model_of_noise_adds_need_no_row_in_the_recovery() -> None:
+    stated = {"y1": {"deviation": 0.05, "correlation": "2 s"}, "y2": 0.1}
+    noisy, _ = obsynth.with_noise(CONSTRAINED.replace(Bw=None, Dw=None, noise_names=None), sensor_noise=stated)
+    assert noisy.plant.nx > CONSTRAINED.nx
+    design = obsynth.ui_pi_observer(obsynth.discretise(noisy, 0.1))
+    assert design.recovery.names == CONSTRAINED.state_names
+    assert "recovery as written" in {row.name for row in design.report.checks if row.passed}
+
+
 def test_a_negative_gain_is_no_bound() -> None:
     design = DESIGNS["optimal-filter"]()
     certificate = replace(

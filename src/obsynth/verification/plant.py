@@ -18,6 +18,7 @@ from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.given_matrices import SIGNAL_NAMES
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.signal_names import listed
+from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
@@ -147,17 +148,32 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
     yield follows
     if not follows.passed:
         return
-    if design.recovery is not None and design.recovery.names == derived.recovery.names:
-        yield upper_bound_check(
-            "recovery as written",
-            "the states as written follow from those of the design as its recovery says",
-            _difference(derived.recovery, design.recovery, _STORED_MAPS),
-            DERIVED_TOLERANCE,
-            source=_SOURCE,
-            kind="equality",
-        )
+    if design.recovery is not None:
+        yield _recovery_row(derived.recovery, design.recovery)
     if source.sample_time is not None and observer.fault_names:
         yield from _sampling_rows(source.smooth, source.sample_time, plant, observer, model)
+
+
+def _recovery_row(derived: StateRecovery, own: StateRecovery) -> Check:
+    """Return the row that the states as written are recovered as they are by the steps done again: under their names
+    and about their operating point, as they are printed.  States that a step before these has added have no row."""
+    wrong = [name for name in own.names if name not in derived.names]
+    difference = np.inf
+    if not wrong:
+        rows = [derived.names.index(name) for name in own.names]
+        kept = SimpleNamespace(**{label: getattr(derived, label)[rows] for label in _STORED_MAPS})
+        difference = _difference(kept, own, _STORED_MAPS)
+        points = [name for name in own.names if own.operating_point.get(name) != derived.operating_point.get(name)]
+        wrong = [f"operating point of {name}" for name in points]
+    return upper_bound_check(
+        "recovery as written",
+        "the states as written follow from those of the design as its recovery says",
+        np.inf if wrong else difference,
+        DERIVED_TOLERANCE,
+        source=_SOURCE,
+        kind="equality",
+        detail=f"not of the plant as written: {', '.join(wrong)}" if wrong else "",
+    )
 
 
 def _numbers_missed(source: PlantSource, known: ExactNumbers | None, own: ExactNumbers | None) -> float:
@@ -285,7 +301,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
                 wrong.append(f"{label} as written")
         if plant.dt != (source.plant.dt if source.sample_time is None else source.sample_time):
             wrong.append("sample time")
-        wrong += _wrong_noise(source, plant)
+        wrong += _wrong_noise(source, plant, design.recovery)
     if source is None and not wrong:
         return
     yield nothing_wrong(
@@ -296,18 +312,25 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
     )
 
 
-def _wrong_noise(source: PlantSource, plant: DescriptorSystem) -> list[str]:
-    """Return covariances of the noise that do not follow from the plant as written: factors are not unique."""
+def _wrong_noise(source: PlantSource, plant: DescriptorSystem, recovery: StateRecovery | None) -> list[str]:
+    """Return covariances of the noise, in the plant and in the states as written, that do not follow from the plant as
+    written: factors are not unique."""
     try:
-        made = source.derived.plant
+        derived = source.derived
     except ObsynthError:
         return ["plant as written"]
-    if not source.plant.nw and plant.nw:
-        return []  # stated for the plant of the design
+    made = derived.plant
+    if not source.plant.nw:
+        return []  # none, or stated for the plant of the design
     if made.nx != plant.nx or made.ny != plant.ny:
         return ["size of the plant as written"]
     one, other = (np.vstack([item.Bw, item.Dw]) for item in (made, plant))
+    if recovery is not None and recovery.names == derived.recovery.names and recovery.by_operator is None:
+        pairs = ((one, derived.recovery), (other, recovery))
+        one, other = (np.vstack([rows, back.from_noise, back.noise_kept]) for rows, back in pairs)
     first, second = one @ one.T, other @ other.T
+    if first.shape != second.shape:
+        return ["size of the noise as written"]
     size = np.sqrt(np.maximum(np.diag(first), np.diag(second)))
     missed = np.abs(first - second) > FAMILY_TOLERANCE * np.outer(size, size)
     return ["covariance of the noise"] if missed.any() else []
