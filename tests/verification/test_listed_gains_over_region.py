@@ -73,3 +73,14 @@ def test_estimates_of_a_filter_over_a_region_are_not_late(name: str) -> None:
 def test_options_of_a_scheduled_design_can_be_read() -> None:
     design = made("filter")
     assert failures(design.replace(options={**design.options, "weight": "x"})) == {"options"}
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("state_bounds", {"x1": [0.0, 1.0]}), ("sensors", {"y1": {"every": 2}}), ("early_constraints", True),
+     ("outliers", "gate"), ("initial_state", [1.0, 0.0])],
+)  # fmt: skip
+def test_options_that_a_scheduled_filter_does_not_have_are_not_listed(option: str, value: object) -> None:
+    """Bounds of states, or sensors of their own times, that a file states but its filter does not know, are none."""
+    design = made("Kalman")
+    assert failures(design.replace(options={**design.options, option: value})) == {"options over the region"}

@@ -9,6 +9,7 @@ import numpy as np
 from obsynth.analysis.existence.kalman_over_region import kalman_conditions_over_region
 from obsynth.errors import SpecError
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
+from obsynth.methods.descriptor_kalman.options_over_region import not_over_region
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import output_covariance
 from obsynth.observers.scheduled.observer import ScheduledObserver
@@ -16,7 +17,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.proofs.vertex_inequalities import Vertex, pairs_of
-from obsynth.results.checks import Check, fitting_check, information
+from obsynth.results.checks import Check, fitting_check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.identities import Identity, Residual, equality
@@ -65,6 +66,12 @@ def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
     yield fitting_check("observer, certificate, noise and plant have matching signals and shapes", fits=fits)
     if tracking is None or noise is None or not fits:
         return
+    yield nothing_wrong(
+        "options over the region",
+        "no option is stated that a filter over a region does not have",
+        not_over_region(design.options),
+        source="options",
+    )
     yield from condition_rows(kalman_conditions_over_region(plant))
     same = same_scheduling_row(plant, observer)
     yield same

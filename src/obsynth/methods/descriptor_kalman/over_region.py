@@ -23,6 +23,7 @@ from obsynth.analysis.existence.kalman import without_unknown_inputs
 from obsynth.analysis.existence.kalman_over_region import free_equations, kalman_conditions_over_region
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
+from obsynth.methods.descriptor_kalman.options_over_region import not_over_region
 from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, analysed, certified
 from obsynth.methods.method import Method, Synthesis
@@ -35,11 +36,6 @@ from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.over_region import GAIN_WITNESSES, rows_to_forget, stored_witness
 
-#: Options of the filter of a constant plant that the one over a region does not have.
-NOT_OVER_REGION = (
-    "initial_state", "initial_covariance", "early_constraints", "outliers", "outlier_limit", "outlier_sizes", "sensors",
-    "state_bounds",
-)  # fmt: skip
 #: Relative distance of the mean square to the least one: the bare optimum is badly conditioned.
 MARGIN = 1e-3
 #: A state whose deviation is below this share of the largest is as good as known, and counts as if it were that.
@@ -50,8 +46,8 @@ ROUNDING_SHARE = 1e-13
 
 def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: Callable[[str], None]) -> Synthesis:
     """Return a scheduled Kalman filter with its certificate; see `obsynth.descriptor_kalman`."""
-    options, plain = method.as_given(), type(method)().as_given()
-    unsupported = [name for name in NOT_OVER_REGION if options[name] is not plain[name]]
+    options = method.as_given()
+    unsupported = not_over_region(options)
     if unsupported:
         raise SpecError(
             f"A Kalman filter over a region has no {', '.join(unsupported)}: leave it out. It takes Q and R.",
