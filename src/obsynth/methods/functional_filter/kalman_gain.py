@@ -32,8 +32,9 @@ from obsynth.plants.faults import Exosystem
 #: solution without: a mode that nothing drives would never be corrected.
 SHARES_OF_NOISE = (0.0, 1e-6, 1e-4, 1e-2, 1.0)
 
-#: Noise that exact rows (equations without outputs and noise) are held to have, as a share of the sensors', by whether
-#: the plant is sampled: a continuous gain would be infinite without, a sampled one need not be.
+#: Noise that exact rows (equations without outputs and noise, sensors that have none beside others that have some) are
+#: held to have, as a share of the sensors', by whether the plant is sampled: a continuous gain would be infinite
+#: without, a sampled one need not be.
 SHARES_OF_EXACT_ROWS = {True: (0.0, 1e-6, 1e-3), False: (1e-3, 1e-2, 0.1)}
 
 #: A pole this close to the boundary of stability, of a sampled filter, or relative to its matrix, is none that a proof
@@ -160,7 +161,12 @@ def exact_rows(model: FilterModel) -> FloatArray:
 
 
 def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
-    """Raise `PreconditionError` where a combination of outputs is free of noise; equations without any may be."""
+    """Raise `PreconditionError` where a combination of outputs is free of noise, and so is all else that is measured.
+
+    Beside others that have noise it may be: a gain for a share of theirs has no more noise than that of a filter
+    without the sensor, since a sensor that is worse than this one leaves it there."""
+    if noise.any():
+        return
     measured = model.L[:, model.L.shape[1] - len(plant_outputs) :]
     trusted = exact_rows(model) @ measured
     if not trusted.size or float(np.max(np.abs(trusted))) <= RANK_TOLERANCE * float(np.max(np.abs(measured))):

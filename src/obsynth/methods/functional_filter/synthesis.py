@@ -101,7 +101,7 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
         {"T": t, "T0": t0},
         observer,
         Certificate(matrices, claims),
-        notes=(*notes, *_notes(plant, slowest, rates, step_times)),
+        notes=(*notes, *_notes(plant, slowest, rates, step_times), *_silent_sensor_notes(noisy, gains)),
         plant=noisy if noisy is not plant else None,
     )
 
@@ -268,6 +268,18 @@ def _resolved(
     chosen = np.concatenate([np.zeros(0), *rates])
     options["fault_rate_found"] = None if method.fault_rate is not None or not chosen.any() else chosen.tolist()
     return options
+
+
+def _silent_sensor_notes(plant: DescriptorSystem, gains: Sequence[_ModelGain]) -> list[str]:
+    """Return the note on sensors without noise that a gain is held to have."""
+    silent = [name for name, row in zip(plant.output_names, plant.Dw, strict=True) if not row.any()]
+    share = max((gain.shares[1] for _, gain in gains), default=0.0)
+    if not plant.nw or not silent or not share:
+        return []
+    return [
+        f"No noise is stated for {', '.join(silent)}: the gain is that for {share:g} times the largest noise of the "
+        "plant there, since without any it would be infinite. State sensor_noise for a smaller one."
+    ]
 
 
 def _notes(
