@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 from tests.support.corruptions import with_claims, with_matrices
 
 import obsynth
@@ -106,6 +106,24 @@ def test_in_continuous_time_one_gain_serves_all_vertices(continuous: ObserverDes
     assert np.array_equal(*gains)
     assert np.abs(gains[0]).max() < 1e3
     assert any("the same at all vertices" in note for note in continuous.notes)
+
+
+def _noise_at_rest(design: ObserverDesign) -> float:
+    """Return the largest H2 norm from the outputs to a fault estimate, over the vertices."""
+    observer, found = design.scheduled[1], []
+    for Az, By in zip(observer.Az, observer.By, strict=True):
+        rows = observer.Cz[observer.fault_rows]
+        found.append(np.sqrt(np.diag(rows @ solve_continuous_lyapunov(Az, -By @ By.T) @ rows.T)).max())
+    return float(max(found))
+
+
+def test_the_noise_is_told_and_a_smaller_drive_of_the_faults_makes_it_less(continuous: ObserverDesign) -> None:
+    told = continuous.report["noise amplification at rest"].value
+    assert told == pytest.approx(_noise_at_rest(continuous), rel=1e-6)
+    assert any("{fault: 0.3}" in note for note in continuous.notes)
+    quieter = obsynth.ui_pi_observer(continuous_plant(), noise={"fault": 0.3})
+    assert quieter.report["noise amplification at rest"].value < 0.98 * told
+    assert quieter.certificate.claims["region_gain"] > continuous.certificate.claims["region_gain"]
 
 
 def test_a_decay_that_is_asked_for_is_proved() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.analysis.existence.augmented_pencils import shipped_model
 from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_over_region
 from obsynth.methods.ui_pi_observer.identities import identities
-from obsynth.methods.ui_pi_observer.number_checks import gain_rows
+from obsynth.methods.ui_pi_observer.number_checks import gain_rows, noise_at_rest_row
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.faults import Exosystem
@@ -185,4 +185,5 @@ def _proved_rows(design: ObserverDesign, plant: PolytopicSystem, observer: Sched
             )
         if plant.is_discrete and steps is None:
             yield switching_row(vertices, level)
+        yield noise_at_rest_row([observer.at_vertex(place) for place in range(plant.count)])
     yield forgetting_row(decay, observer.forgetting, discrete=plant.is_discrete)

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 #: What to make of the freedom that poles leave.
 OBJECTIVES = ("conditioning", "gain")
 
+#: The row on the noise of an observer over a region.
+NOISE_AT_REST_ROW = "noise amplification at rest"
+
 
 @dataclass(frozen=True)
 class UiPiObserver(Method):

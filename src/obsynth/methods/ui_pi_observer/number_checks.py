@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from obsynth.analysis.existence.augmented_pencils import AugmentedPlant, numbers
+from obsynth.methods.ui_pi_observer.method import NOISE_AT_REST_ROW
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.spectra import (
     DOUBLE_DIGITS,
@@ -112,6 +113,25 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
         text = "H2 norm from white noise on every output to a fault estimate"
         yield information("noise amplification", text, np.nan, source="recomputed, Lyapunov equation", detail=UNCERTAIN)
     yield from fault_noise_rows(ErrorModel(plant, observer, design.certificate.matrices["tracking"][:, : plant.nx]))
+
+
+def noise_at_rest_row(observers: Sequence[LinearObserver]) -> Check:
+    """Return how much noise reaches a fault estimate at the vertex where that is most, while parameters rest there."""
+    deviations = []
+    for observer in observers:
+        rows, direct = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
+        unit = certain_noise_covariance(observer.Az, observer.By, rows, float(observer.dt > 0.0) * direct, observer.dt)
+        deviations.append(np.sqrt(np.maximum(np.diag(unit), 0.0)).max(initial=0.0))
+    largest = float(np.max(deviations))  # NaN where one has no digits
+    units = "outputs in their own units" + ("" if observers[0].dt else "; times the root of the sample time in s")
+    return information(
+        NOISE_AT_REST_ROW,
+        "the largest H2 norm from white noise on every output to a fault estimate, at a vertex at which the parameters "
+        "rest",
+        largest,
+        source="Lyapunov equation at every vertex",
+        detail=UNCERTAIN if np.isnan(largest) else units,
+    )
 
 
 def gain_rows(

@@ -31,7 +31,7 @@ from obsynth.methods.engines.vertex_certificates import (
 )
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
-from obsynth.methods.ui_pi_observer.method import UiPiObserver
+from obsynth.methods.ui_pi_observer.method import NOISE_AT_REST_ROW, UiPiObserver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
@@ -288,6 +288,13 @@ def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -
             "Between the rows of a log the observer takes a step of implicit Euler, along which errors decay in the "
             "norm of the same certificate however long the step is; what such a step misses of the plant's own motion "
             "acts as a disturbance. Rows that are close beside the plant's time constants keep it small."
+        )
+    if plant.nf:
+        notes.append(
+            "What is made small is a gain from states, faults and noise together. The noise of the fault estimates has "
+            f"no claim of its own; the row '{NOISE_AT_REST_ROW}' has its size while the parameters rest. A smaller "
+            "drive of the faults (option noise, such as {fault: 0.3}) weighs the noise more: mostly less of it comes "
+            "with a larger gain."
         )
     rated = plant.scheduling.rated_names
     if rated and not used:
