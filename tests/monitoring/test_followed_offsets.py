@@ -75,3 +75,26 @@ def test_several_logs_show_drifts_themselves_and_nothing_is_followed(tmp_path: P
     assert "followed" not in several.statement
     assert "are followed and alarm nothing" in learned().statement
     assert obsynth.load_thresholds(learned().save(tmp_path / "t.json")).memory == 300.0
+
+
+@pytest.mark.long
+def test_an_offset_from_the_first_row_on_ends_and_a_jump_soon_after_the_start_does_not(tmp_path: Path) -> None:
+    """A sensor that was off by one deviation from the first row on was in alarm for nine of ten rows."""
+    monitor = obsynth.online_monitor(pumped(), "learned", normal=learned())
+    whole = log(5)
+    whole["y"] += NOISE
+    run = obsynth.run_on_data(pumped(), whole, monitor=monitor)
+    found = run.table["alarm"].ne("").to_numpy()
+    assert found[:200].any()
+    assert not found[200:].any()
+    assert any("taken for what is usual in this log" in text for text in run.warnings)
+    assert "ends there" in learned().statement
+    parts = [
+        obsynth.run_on_data(pumped(), part, monitor=monitor, state=tmp_path / "s.json").table
+        for part in (whole[:150], whole[150:])
+    ]
+    np.testing.assert_array_equal(pd.concat(parts)["statistic"], run.table["statistic"])
+    jump = log(8)
+    jump.loc[150:, "y"] += 4.0 * NOISE
+    later = obsynth.run_on_data(pumped(), jump, monitor=monitor)
+    assert later.table["alarm"].ne("").to_numpy()[150:].mean() > 0.5

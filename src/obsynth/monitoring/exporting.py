@@ -14,9 +14,14 @@ from obsynth.exporting.alarms import STATISTIC, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
 from obsynth.monitoring.thresholds.euler_rule import EulerRule
-from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
-from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, LearnedRule, follow_shares
+from obsynth.monitoring.thresholds.learned_rule import (
+    FOLLOWED_MOST,
+    OWN_MOST,
+    LearnedRule,
+    follow_shares,
+)
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
@@ -85,11 +90,12 @@ class LearnedMonitorInC:
             f"    REAL before[{(1 + width) * width}];",
             f"    REAL scores[{max(AGES) * 2 * width}];",
             f"    REAL centres[{width}];",
+            f"    REAL own[{m + width}];",
             f"    REAL repeated[{max(self.outputs, 1)}];",
             f"    long equal[{max(self.outputs, 1)}];",
             f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
             f"    REAL raised_now[{max(inputs, 1)}];",
-            "    int at, quiet, to_wait, alarmed;",
+            "    int at, quiet, to_wait, alarmed, begun;",
             "    long taken;",
             f"}} {prefix}_monitor;",
             "",
@@ -142,14 +148,18 @@ class LearnedMonitorInC:
             "MONITOR_INPUTS": 0 if learned.ranges is None else len(learned.ranges.middle_and_half()[0]),
             "MONITOR_STATISTICS": len(learned.levels),
             "MONITOR_HOLD": HOLD,
+            "MONITOR_OWN": OWN_ROWS[0],
+            "MONITOR_OWN_LATER": OWN_ROWS[1],
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
 
     def _follow_numbers(self) -> dict[str, float]:
         """Return how an offset of residuals is followed, by the names of the numbers in C."""
         usual, in_alarm = follow_shares(self.learned.memory)
-        names = ("MONITOR_FOLLOW", "MONITOR_FOLLOW_IN_ALARM", "MONITOR_FOLLOWED_MOST", "MONITOR_FAULTS_SLOWER")
-        return dict(zip(names, (usual, in_alarm, FOLLOWED_MOST, FAULTS_SLOWER), strict=True))
+        return {
+            "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
+            "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
+        }  # fmt: skip
 
     def _tables(self) -> dict[str, Any]:
         """Return the numbers of the thresholds, by their names in C."""

@@ -343,6 +343,17 @@ class LogRun:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
 
+    def taken_for_usual(self) -> tuple[str, ...]:
+        """Return a text where an alarm of thresholds from one log ended as it had stood since the start."""
+        if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule) or not self._watching.rule.ended:
+            return ()
+        return (
+            f"An alarm stood when {self._watching.rule.ended} rows had been decided, and was ended there: the "
+            "thresholds are of one log, which does not distinguish an offset of this log from a fault that was there "
+            "from its first row on, so that these rows are taken for what is usual in this log. If the alarm was a "
+            "fault, it may still be there. Three normal logs tell (learn the thresholds from them).",
+        )
+
     def _time_text(self, time: float) -> str:
         return f"{time:.15g}" if self.stamps is None else self.stamps.shown(time)
 

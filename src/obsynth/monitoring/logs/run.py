@@ -362,6 +362,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
             *start,
             *stuck_texts(stuck),
             *(() if run.beyond is None else run.beyond.texts(run.rows)),
+            *run.taken_for_usual(),
         ),
         digest=digest,
         stamps=stamps,

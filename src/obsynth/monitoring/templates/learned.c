@@ -28,6 +28,10 @@ static void monitor_reset(PREFIX_monitor *m)
     for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
         m->scores[i] = 0;
     }
+    for (i = 0; i < CHANNELS + MONITOR_WIDTH; i++) {
+        m->own[i] = 0;
+    }
+    m->begun = 0;
     for (i = 0; i < MONITOR_OUTPUTS; i++) {
         m->repeated[i] = 0;
         m->equal[i] = 0;
@@ -337,6 +341,48 @@ static void monitor_centre(PREFIX_monitor *m, const REAL *theta, const REAL *cov
     }
 }
 
+/* Let the first rows of a log, once they are enough, be what is usual in it, where there is an alarm. */
+static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
+{
+    int is_finite = 1;
+    int i;
+    if (!(MONITOR_FOLLOW > 0) || MONITOR_ESTIMATES == 0 || covariance == NULL || m->begun >= MONITOR_OWN_LATER) {
+        return;
+    }
+    for (i = 0; i < CHANNELS; i++) {
+        REAL white = m->white[m->at * CHANNELS + i] + m->slow[i];
+        white = white > MONITOR_OWN_MOST ? MONITOR_OWN_MOST : white;
+        white = white < -MONITOR_OWN_MOST ? -MONITOR_OWN_MOST : white;
+        m->own[i] += isnan(white) ? 0 : white;
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        m->own[CHANNELS + i] += theta[i];
+    }
+    m->begun++;
+    for (i = 0; i < CHANNELS + MONITOR_ESTIMATES; i++) {
+        is_finite = is_finite && isfinite(m->own[i]);
+    }
+    if (!m->alarmed || !is_finite || (m->begun != MONITOR_OWN && m->begun != MONITOR_OWN_LATER)) {
+        return;
+    }
+    for (i = 0; i < CHANNELS; i++) {
+        m->slow[i] = m->own[i] / (REAL)m->begun;
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        m->centres[i] = m->own[CHANNELS + i] / (REAL)m->begun;
+    }
+    for (i = 0; i < OLDEST * CHANNELS; i++) {
+        m->white[i] = 0;
+    }
+    for (i = 0; i < MEANS * CHANNELS; i++) {
+        m->means[i] = 0;
+    }
+    for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
+        m->scores[i] = 0;
+    }
+    m->alarmed = 0;
+}
+
 /* The largest likelihood ratios over all ages of a change of each fault; return the one of which a change alone is more
  * likely than of any other at the most likely age, or -1 where they are not distinguished. */
 static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
@@ -482,6 +528,9 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
         m->alarmed = m->alarm;
+        if (known) {
+            monitor_own(m, shown, covariance);
+        }
     }
     if (m->alarm) {
         m->fault = MONITOR_ESTIMATES > 0 ? changed : monitor_told[which % (SHAPES / 2)];

@@ -63,6 +63,11 @@ NO_PAIRS = WrongPairs(0, 0.0)
 #: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
 FAULTS_SLOWER = 2.0
 
+#: Thresholds of one log do not tell an offset of another log from a fault that is there from its first row on: an alarm
+#: that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is usual
+#: from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
+OWN_ROWS = (100, 200)
+
 
 @dataclass(frozen=True, eq=False)
 class LearnedThresholds:
@@ -226,6 +231,11 @@ class LearnedThresholds:
                 "one log does not distinguish slow faults from drifts: offsets of the residuals that come over more "
                 f"than about {self.memory:.6g} rows ({duration(self.memory * self.dt)}), and changes of the faults "
                 f"over more than {FAULTS_SLOWER * self.memory:.6g}, are followed and alarm nothing"
+            )
+            yield (
+                "nor does it distinguish a fault that is there from the first row of a run on from an offset of that "
+                f"log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends there, as the "
+                "means of these rows are taken for what is usual in this log"
             )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
 from obsynth.monitoring.thresholds.hypotheses import ranked, ranked_changes
-from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.parameter_scores import (
@@ -38,6 +38,10 @@ NOTHING = read_only(np.zeros(0))
 #: Deviations by which a row moves the offset that is followed, at most: a wrong sample says no more than others.
 FOLLOWED_MOST = 3.0
 
+#: Deviations of a row that count in the means of a start, at most: one wrong sample moves them by a tenth, and an
+#: offset that is larger stays an alarm.
+OWN_MOST = 10.0
+
 #: While a level is passed the offset is followed so many times more slowly: what has come quickly stays an alarm.
 SLOWER_IN_ALARM = 10.0
 
@@ -58,6 +62,9 @@ class LearnedState(NamedTuple):
     centres: FloatArray = NOTHING  # ``(nf,)``: the faults from which changes are looked for
     alarmed: int = 0  # whether the latest row that was decided passed a level
     raised: FloatArray = NOTHING  # ``(ages, nu)``: how far beyond their ranges the inputs of rows are, latest last
+    begun: int = 0  # rows since the start that say what is usual in this log, up to the last of `OWN_ROWS`
+    own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults
+    ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
 
 
 def follow_shares(memory: float) -> tuple[float, float]:
@@ -79,7 +86,8 @@ class LearnedRule(Rule):
     likely.
 
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
-    exponential means follow them, ten times more slowly after a row in alarm."""
+    exponential means follow them, ten times more slowly after a row in alarm.  An alarm that stands
+    after the first `OWN_ROWS` rows of a run ends there: their means take the place of what the one log had."""
 
     def __init__(
         self,
@@ -116,7 +124,7 @@ class LearnedRule(Rule):
         inputs = 0 if self._ranges is None else self._ranges.inputs
         state = LearnedState(
             np.tile(model.mean, (model.order, 1)), white, means, effects=effects, slow=np.zeros(model.channels),
-            raised=np.ones((max(AGES), inputs)),
+            raised=np.ones((max(AGES), inputs)), own=np.zeros(model.channels + len(self._names)),
         )  # fmt: skip
         if self._walk is None:
             return state
@@ -177,7 +185,7 @@ class LearnedRule(Rule):
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
             values = values / (self.learned.levels * self._factors(state))
         values = np.where(np.isnan(values), np.inf, values)
-        state = state._replace(alarmed=int(values.max() > 1.0))
+        state = self._own_of_start(state._replace(alarmed=int(values.max() > 1.0)), sample.observation, counts=counts)
         # Faults are compared without what their slow offsets explain: each has its own.
         fault = (
             self._fault(values_of_row, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
@@ -234,6 +242,23 @@ class LearnedRule(Rule):
             away = np.clip((observation.theta - state.centres) / deviations, -FOLLOWED_MOST, FOLLOWED_MOST)
             moved = state.centres + self._shares[state.alarmed] / FAULTS_SLOWER * away * deviations
         return state._replace(centres=np.where(np.isfinite(moved), moved, state.centres))
+
+    def _own_of_start(self, state: LearnedState, observation: Any, *, counts: bool) -> LearnedState:
+        """Return the state after a row that may be one of the first of a log: where an alarm stands once these are
+        enough, they are what is usual in this log, and the rows before say nothing against that."""
+        followed = self._walk is not None and self._shares[0] > 0.0
+        if not (followed and counts and isinstance(observation, Evidence)) or state.begun >= OWN_ROWS[-1]:
+            return state
+        white = np.clip(np.nan_to_num(state.white[-1] + state.slow), -OWN_MOST, OWN_MOST)
+        own, begun = state.own + np.concatenate([white, observation.theta]), state.begun + 1
+        state = state._replace(own=own, begun=begun)
+        if begun not in OWN_ROWS or not state.alarmed or not np.isfinite(own).all():
+            return state
+        slow, centres = np.split(own / begun, [len(white)])
+        return state._replace(
+            slow=slow, centres=centres, white=np.zeros_like(state.white), means=np.zeros_like(state.means),
+            scores=np.zeros_like(state.scores), alarmed=0, ended=begun,
+        )  # fmt: skip
 
     def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
         """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,
