@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from obsynth.monitoring.alarms.events import (
+    NAMED_BY_THE_FIRST,
     NOT_VALID,
     AlarmEvent,
     AlarmLog,
@@ -119,3 +120,12 @@ def test_shares_name_a_fault_where_they_suffice_and_else_all_that_are_as_likely(
              ranking=output.ranking)  # fmt: skip
     heading, row = alarm_rows(log.events(), str)[0]
     assert dict(zip(heading, row, strict=True))["fault"] == shown
+
+
+def test_a_long_alarm_says_that_later_faults_may_have_no_name() -> None:
+    log = AlarmLog(())
+    ranking = Ranking((("lost", 0.9), ("leak", 0.1)), "lost")
+    for row in range(1, 260):
+        log.advance(0)
+        log.take("learned", "lost", 2.0, float(row), row, (), ranking=ranking)
+        assert (NAMED_BY_THE_FIRST in alarm_notes(log.events())) == (row > 200)

@@ -491,3 +491,23 @@ def test_floats_keep_the_bound_that_their_header_states(shipped: Shipped, tmp_pa
     assert (errors >= 1e-3 * bounds).all()
     with pytest.raises(obsynth.SpecError, match="precision"):
         obsynth.export(design, tmp_path / "a.npz", precision="float")
+
+
+@pytest.mark.long
+def test_c_ends_an_alarm_that_stands_since_the_start_as_a_run_does(shipped: Shipped, tmp_path: Path) -> None:
+    design, log = shipped.design(WALKING), log_of(shipped.design(WALKING))
+    # A sensor that is off from the first row on, and levels that it passes in every row.
+    log["Tair"] += 6.0 * np.sqrt(np.atleast_2d(design.observer.R)[0, 0])
+    learned = replace(told(design), levels=0.02 * told(design).levels)
+    monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
+    run = obsynth.run_on_data(design, log, monitor=monitor)
+    assert any("taken for what is usual in this log" in text for text in run.warnings)
+    sources = obsynth.export(design, tmp_path / "walking.c", monitor=monitor, unverified=True)
+    text, width = harness(design, "walking")
+    (tmp_path / "run.c").write_text('#include "walking.h"\n' + text)
+    files = [str(file) for file in (*sources, tmp_path / "run.c") if file.suffix == ".c"]
+    subprocess.run([str(COMPILER), *FLAGS, *files, "-o", str(tmp_path / "run.so"), "-lm"], check=True)
+    count, pointer = len(design.observer.fault_names) + design.plant.ny + 3, ctypes.POINTER(ctypes.c_double)
+    given, out = np.concatenate([np.zeros(count), log.to_numpy()[:, 1:].ravel()]), np.zeros((ROWS, width))
+    ctypes.CDLL(str(tmp_path / "run.so")).run_walking(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), ROWS)
+    np.testing.assert_allclose(out[:, -2], run.table["statistic"], rtol=1e-9)

@@ -32,6 +32,12 @@ NOT_VALID = (
     "outside."
 )
 
+#: What is said of names where an alarm lasted for longer than changes are looked for.
+NAMED_BY_THE_FIRST = (
+    "An alarm keeps the name of what began it: another fault that came while it stood, or soon after, may have no name "
+    "of its own here. Its time is where the statistic of the output rises again."
+)
+
 #: Rows in alarm without a fault that fits after which an alarm is shelved: the oldest change that is looked for.
 SHELVED_AFTER = max(AGES)
 
@@ -317,8 +323,10 @@ def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
 
 
 def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
-    """Return what a reader of the table has to know about its intervals."""
-    return [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []
+    """Return what a reader of the table has to know about its intervals, and about names of long alarms."""
+    notes = [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []
+    is_long = any(event.shares and event.last_row - event.first_row >= SHELVED_AFTER for event in events)
+    return [*notes, NAMED_BY_THE_FIRST] if is_long else notes
 
 
 def silence(run: Any, by: str) -> list[str]:
