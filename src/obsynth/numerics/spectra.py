@@ -36,9 +36,15 @@ ROUNDING_OF_EIGENVALUES = 10.0
 #: Modes slower than this share of the fastest, or of a rate that the plant has anyway, are integrators and rounding.
 STANDING = 1e-6
 
+#: Real or imaginary part of a pole, as a share of its modulus, below which it is rounding of trigonometry and of QZ.
+ROUNDING_OF_A_POLE = 1e-12
+
 
 def pole_text(value: complex, digits: int = 4, *, pair: bool = False) -> str:
-    """Return a pole, a zero or an eigenvalue as text, a conjugate ``pair`` as one."""
+    """Return a pole, a zero or an eigenvalue as text, a conjugate ``pair`` as one; a part that is rounding of the other
+    is left out."""
+    rounding = ROUNDING_OF_A_POLE * abs(value)
+    value = complex(*(0.0 if abs(part) < rounding else part for part in (value.real, value.imag)))
     if value.imag == 0.0:
         return f"{value.real:.{digits}g}"
     return f"{value.real:.{digits}g} +- {abs(value.imag):.{digits}g}j" if pair else f"{value:.{digits}g}"

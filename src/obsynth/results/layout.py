@@ -88,8 +88,16 @@ def duration(seconds: float, *, digits: int = 3) -> str:
 
 
 def complex_numbers(values: Iterable[complex]) -> str:
-    """Return several values as text, largest first; conjugate pairs once, as ``a +- bj``; long lists are cut."""
-    waiting = sorted((complex(value) for value in values), key=lambda value: (-abs(value), -value.real, -value.imag))
+    """Return several values as text, largest first; conjugate pairs once, as ``a +- bj``; long lists are cut.
+
+    What is below one rounding of the largest is zero: computed eigenvalues are not known better.
+    """
+    listed = [complex(value) for value in values]
+    rounding = math.ulp(1.0) * max(map(abs, listed), default=0.0)
+    waiting = sorted(
+        (value if abs(value) >= rounding else 0j for value in listed),
+        key=lambda value: (-abs(value), -value.real, -value.imag),
+    )
     texts: list[str] = []
     while waiting:
         value = waiting.pop(0)
