@@ -666,7 +666,7 @@ class TestGainSets:
 
     @pytest.mark.parametrize(
         ("prepare", "fragment"),
-        [(lambda path: None, "No such file"), (lambda path: path.mkdir(), "directory")],
+        [(lambda path: None, "does not exist"), (lambda path: path.mkdir(), "is a folder: give the name of a file")],
         ids=["missing", "a folder"],
     )
     def test_unreadable(self, prepare: Any, fragment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -114,6 +114,12 @@ def test_bad_arguments(spec, tmp_path, capsys, extra, path):
     assert json.loads(capsys.readouterr().out)["path"] == path
 
 
+@pytest.mark.parametrize(("values", "code"), [("decy=[0.2, 0.3]", 2), ("residual_weight_limit=[-1, 10]", 0)])
+def test_cases_that_are_all_malformed_are_an_error(spec, tmp_path, capsys, values, code):
+    assert main(["sweep", "--system", spec, "--out", str(tmp_path / "many"), "--set", values]) == code
+    assert f"{2 if code else 1} malformed" in capsys.readouterr().out
+
+
 def test_the_folder_is_a_file(spec, tmp_path):
     assert main(["sweep", "--system", spec, "--out", spec]) == 2
 

@@ -122,22 +122,29 @@ def _similar_files(path: Path) -> str:
     return f" Did you mean {' or '.join(str(path.parent / name) for name in close)}?" if close else ""
 
 
-def _files_inside(folder: Path) -> str:
-    """Return a question with the specs in a folder, ``spec.yaml`` where there is one; empty where there are many."""
+def _files_inside(folder: Path, suffixes: tuple[str, ...]) -> str:
+    """Return a question with the files in a folder that end so, ``spec.yaml`` if it is one; empty where many do."""
     try:
-        specs = sorted(entry for entry in folder.iterdir() if entry.suffix in (".yaml", ".yml") and entry.is_file())
+        files = sorted(entry for entry in folder.iterdir() if entry.name.endswith(suffixes) and entry.is_file())
     except OSError:
         return ""
-    specs = [entry for entry in specs if entry.name in ("spec.yaml", "spec.yml")] or specs
-    return f" Did you mean {' or '.join(map(str, specs))}?" if 0 < len(specs) <= MOST_FILES_NAMED else ""
+    files = [entry for entry in files if entry.name in ("spec.yaml", "spec.yml")] or files
+    return f" Did you mean {' or '.join(map(str, files))}?" if 0 < len(files) <= MOST_FILES_NAMED else ""
 
 
-def input_file(path: Path, *, where: str | None = None, is_protected: bool = True) -> Path:
-    """Return ``path`` if it is a regular file, and protect it; anything else is a `SpecError` at ``where``."""
+def input_file(
+    path: Path,
+    *,
+    where: str | None = None,
+    is_protected: bool = True,
+    suffixes: tuple[str, ...] = (".yaml", ".yml"),
+) -> Path:
+    """Return ``path`` if it is a regular file, and protect it; anything else is a `SpecError` at ``where``, of a folder
+    with its files that end in ``suffixes``."""
     place = where or str(path)
     try:
         if path.is_dir():
-            raise SpecError(f"{path} is a folder: give the name of a file.{_files_inside(path)}", path=place)
+            raise SpecError(f"{path} is a folder: give the name of a file.{_files_inside(path, suffixes)}", path=place)
         if not path.exists():
             raise SpecError(f"{path} does not exist.{_similar_files(path)}", path=place)
         kind = special_kind(path)

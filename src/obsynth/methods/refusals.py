@@ -91,7 +91,7 @@ def with_advice(
     candidates = _as_noisy_as_others(plant, state_sensors(plant)) if sensors is None else sensors
     sets = () if without else least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if without:
-        text = f"It exists {', and '.join(without)}."
+        text = f"It exists {', or '.join(without)}."
     elif sets:
         text = f"Measure one of: {listed_sets(sets)}."
     elif drops := _drops(plant, holds):

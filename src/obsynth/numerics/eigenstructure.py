@@ -16,7 +16,7 @@ import numpy as np
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
-from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
+from obsynth.numerics.spectra import SAME_POLE, decay_rates, pole_text, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
 STARTS, FEW_STARTS, LARGE_PAIR = 8, 2, 20
@@ -231,14 +231,16 @@ def checked_poles(
     listed = [as_pole(pole) for pole in requested]
     problems = []
     if len(listed) != count:
-        fixed_text = ", ".join(f"{complex(value):.6g}" for value in fixed)
+        fixed_text = ", ".join(pole_text(complex(value), 6) for value in fixed)
         besides = f" (fixed, not to be listed: {fixed_text})" if fixed_text else ""
         problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
     rates = decay_rates(listed, dt)
     unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
     if unstable:
         where = "inside the unit circle" if dt > 0.0 else "in the left half plane"
-        problems.append(f"{', '.join(f'{pole:.6g}' for pole in unstable)} would not be stable: give poles {where}.")
+        problems.append(
+            f"{', '.join(pole_text(pole, 6) for pole in unstable)} would not be stable: give poles {where}."
+        )
     upper = [pole for pole in listed if pole.imag > 0.0]
     lower = [pole for pole in listed if pole.imag < 0.0]
     lonely = []

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import io
-import os
 import re
 import zipfile
 from collections.abc import Callable, Mapping
@@ -41,6 +39,9 @@ MAXIMUM_BYTES = 4_000_000_000
 MOST_GAIN_SET_CHARACTERS = 2_000_000_000
 
 _HEAD_BYTES = 256
+
+#: How names of gain sets end, as a rule, by which those in a folder are found.
+GAIN_SET_SUFFIXES = (".gains.json",)
 
 _Made = TypeVar("_Made")
 
@@ -104,9 +105,6 @@ def load(path: str | Path) -> ObserverDesign:
     fault-estimation-filter
     """
     source = path_of(path)
-    if source.is_dir() or not source.exists():
-        why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
-        raise SpecError(f"{source} cannot be read: {why}.", path=str(source))
     document, arrays = _read_members(source)
     return _design_of(document, arrays, str(source))
 
@@ -146,7 +144,7 @@ def loaded(content: bytes, name: str = "the gain set") -> ObserverDesign:
 
 def _read_members(source: Path) -> tuple[Any, bytes | None]:
     """Return the document of a gain set and, where they are apart, its arrays."""
-    file = input_file(source)
+    file = input_file(source, suffixes=GAIN_SET_SUFFIXES)
     with file.open("rb") as stream:
         start = stream.read(_HEAD_BYTES)
     if not is_packed(start):

@@ -149,8 +149,9 @@ def _proved_rows(
     vertices = _vertices(observer, tracking, noise)
     level = claimed(claims, "region_deviation")
     yield deviation_row(
-        "mean square over the region: the root of the mean square of all state errors together is below this, in the "
-        f"end, for the stated white noise, {words}, whatever they are that does not depend on the noise",
+        "mean square over the region: the root of the mean square of all state errors together, averaged over "
+        f"the samples, is below this in the end, for the stated white noise, {words}, whatever they are that does not "
+        "depend on the noise",
         vertices,
         witness_of_certificate(matrices, pairs, GAIN_WITNESSES),
         level,

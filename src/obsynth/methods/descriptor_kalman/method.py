@@ -79,7 +79,8 @@ class DescriptorKalman(Method):
         ``observer`` is a `RecursiveObserver`; ``gains``: ``L (nx, ne)``, ``K (nx, ny)`` of the last step.
         ``certificate.claims``: ``condition`` (dimensionless; largest of H_k), ``contraction`` (per step),
         ``residual_directions``.  Over a region: a `ScheduledObserver`; ``L (nx, nx)``, ``K (nx, ny)`` and ``S[1]``,
-        ...; ``region_deviation``: the root of the mean square of all state errors, and ``region_decay``.
+        ...; ``region_deviation``: the root of the mean square of all state errors, averaged over the samples, and
+        ``region_decay``.
 
     Raises
     ------
@@ -126,7 +127,9 @@ class DescriptorKalman(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         **RECURSIVE_CLAIMS,
         "region_deviation": ClaimMeaning(
-            "", "root mean square of all state errors over a region, for the stated noise", DEVIATION_ROW
+            "",
+            "root mean square of all state errors over a region, averaged over the samples, for the stated noise",
+            DEVIATION_ROW,
         ),
         "region_decay": ClaimMeaning("", "factor a sample by which errors shrink over a region", DECAY_ROW),
     }

@@ -35,8 +35,9 @@ _BLANKS_BETWEEN = 2
 
 
 def run_sweep(options: argparse.Namespace) -> int:
-    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
+    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to, 2 when all are malformed."""
     from obsynth.studies.sweep import sweep
+    from obsynth.studies.work import WORK_STATUSES
 
     if options.out.exists() and not options.out.is_dir():
         raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
@@ -68,7 +69,8 @@ def run_sweep(options: argparse.Namespace) -> int:
         jobs = usual_jobs(len(options.system) * math.prod(map(len, parameters.values())))
     outcome, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw, jobs=jobs)
     _print_outcome(options, outcome, files, "cases")
-    return 0
+    malformed = WORK_STATUSES[SpecError.exit_code]
+    return SpecError.exit_code if all(result.status == malformed for result in outcome.results) else 0
 
 
 def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> None:
