@@ -94,3 +94,24 @@ def test_gain_norm_and_noise_of_both_weights_are_printed() -> None:
             energy += float(np.sum(design.observer.run(y, np.zeros((400, plant.nu))).faults ** 2))
         own = [design.certificate.claims["gamma"], np.linalg.norm(design.gains["W"], 2), energy**0.5]
         assert printed[name] == pytest.approx(own, rel=1e-3)
+
+
+@pytest.mark.long
+def test_over_a_region_the_better_of_both_weights_is_taken() -> None:
+    """A free weight has a least gain near zero, whose gains are too large to be proved; the paper's weight has less."""
+    vertices = [
+        [[-0.4277258392862703, 1.3666725451354287], [-1.1787610522836187, 2.156636592757382]],
+        [[-0.533022272397674, 1.4968716180022095], [-1.2393627545446404, 2.179584941971496]],
+    ]
+    each = {
+        "C": np.eye(2),
+        "Bf": [[1.1506322195472605], [0.7311580491383763]],
+        "Bd": [[1.229399299301683], [0.6148403165052214]],
+        "dt": 1.0,
+    }
+    plant = obsynth.PolytopicSystem([obsynth.DescriptorSystem(A=vertex, **each) for vertex in vertices])
+    default, paper, free = (
+        obsynth.fault_estimation_filter(plant, **options).certificate.claims["gamma"]
+        for options in ({}, {"weight": "paper"}, {"weight": "free"})
+    )
+    assert default <= 1.001 * min(paper, free)
