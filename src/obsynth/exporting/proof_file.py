@@ -108,14 +108,14 @@ def proof_of(design: ObserverDesign) -> dict[str, Any]:
     Raises
     ------
     SpecError
-        The plant is nonlinear, or changes with k: such designs have no proof file.
+        The plant is nonlinear, changes with k or with parameters of a region: such designs have no proof file.
     PreconditionError
         No claim of the design could be proved.
     """
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         raise SpecError(
-            f"Design {design.name!r} has gains that change with k, or a nonlinear plant: proof files are for linear "
-            "methods with constant matrices. `obsynth verify` checks it.",
+            f"Design {design.name!r} is over an operating region, or has gains that change with k, or a nonlinear "
+            "plant: proof files are for linear methods with constant matrices. `obsynth verify` checks it.",
             path="design",
         )
     proof = _Proof(design)
