@@ -233,3 +233,22 @@ def test_a_default_reference_has_the_order_that_a_finite_mean_square_needs() -> 
     plant = obsynth.DescriptorSystem(A=[[-1]], Bf=[[1]], C=[[1]], Bw=[[0]], Dw=[[1]])
     assert np.shape(obsynth.optimal_filter(plant).options["reference"]["A"]) == (1, 1)
     assert np.shape(obsynth.optimal_filter(plant, norm="h2").options["reference"]["A"]) == (2, 2)
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_outputs_that_need_derivatives_of_a_known_input_cost_nothing(norm: str):
+    """Index 3, outputs with u and its first two derivatives: the least is that of the plant without the input."""
+    matrices = {
+        "E": [[1, 0, 0, 1], [0, 0, -1, 1], [-1, 1, -2, 1], [0, 0, 1, -1]],
+        "A": [[-5, 4, -2, -4], [-7, 6, -2, -5], [-7, 5, -2, -5], [6, -5, 1, 5]],
+        "C": [[-1, 4, 1, 0], [-2, 3, 0, 0], [2, -1, 3, 0]],
+        "Bf": [[-1], [1], [1], [-1]],
+        "Bw": np.hstack([[[0.1], [0.1], [0.1], [-0.1]], np.zeros((4, 3))]),
+        "Dw": np.hstack([np.zeros((3, 1)), 0.05 * np.eye(3)]),
+    }
+    design = obsynth.optimal_filter(obsynth.DescriptorSystem(**matrices, B=[[1], [4], [4], [-3]]), norm=norm)
+    assert design.observer.input_names == ("u1", "derivative of u1", "second derivative of u1")
+    assert any("need the derivative of u1" in note for note in design.notes)
+    alone = obsynth.optimal_filter(obsynth.DescriptorSystem(**matrices), norm=norm)
+    claim = "least" if norm == "hinf" else "least_deviation"
+    assert design.certificate.claims[claim] == pytest.approx(alone.certificate.claims[claim], rel=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from inspect import signature
@@ -20,7 +21,7 @@ from obsynth.methods.region_trials import region_condition
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
 from obsynth.methods.rounding import require_above_rounding
 from obsynth.methods.verifying import verify
-from obsynth.methods.working_plants import working_plant
+from obsynth.methods.working_plants import WorkingPlant, with_derivatives_as_inputs, working_plant
 from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
@@ -204,27 +205,49 @@ def _designed(
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
         working = working_plant(plant, recovery, progress, method)
-        plant, recovery, notes = working.plant, working.recovery, working.notes
-        method = working.method or method
         try:
-            synthesis = method.synthesise(plant, progress=progress, **more)
-        except PreconditionError as error:
-            if not isinstance(plant, DescriptorSystem) or not advise:
+            return _designed_on(working, method, name=name, progress=progress, advise=advise, more=more)
+        except (SolverError, VerificationError):
+            other = with_derivatives_as_inputs(plant, recovery, method, working)
+            if other is None:
                 raise
-            progress("searching for sensors that would make it possible")
-            sensors, done = working.sensors(), notes if working.reduced else ()
-            raise with_advice(error, plant, method, sensors=sensors, notes=done) from None
-        if notes:
-            synthesis = replace(synthesis, notes=(*notes, *synthesis.notes))
-        progress("verifying the shipped realisation")
-        try:
-            return verified(plant, method.id, synthesis, name=name, recovery=recovery)
-        except VerificationError as error:
-            if not advise or error.report is None or {row.name for row in error.report.failures} != {CONSTANT_FAULT}:
-                raise
-            progress("searching for a method that estimates constant faults of this plant")
-            instead = _right_at_constant_faults(plant, method, name, recovery)
-            raise VerificationError(f"{error} {instead}", report=error.report) from None
+            progress("taking derivatives of known inputs as inputs")
+            with suppress(ObsynthError):
+                return _designed_on(other, method, name=name, progress=progress, advise=False, more=more)
+            raise
+
+
+def _designed_on(
+    working: WorkingPlant,
+    method: Method,
+    *,
+    name: str,
+    progress: Callable[[str], None],
+    advise: bool,
+    more: Mapping[str, Any],
+) -> ObserverDesign:
+    """Return the verified design for the plant that a method works on."""
+    plant, recovery, notes = working.plant, working.recovery, working.notes
+    method = working.method or method
+    try:
+        synthesis = method.synthesise(plant, progress=progress, **more)
+    except PreconditionError as error:
+        if not isinstance(plant, DescriptorSystem) or not advise:
+            raise
+        progress("searching for sensors that would make it possible")
+        sensors, done = working.sensors(), notes if working.reduced else ()
+        raise with_advice(error, plant, method, sensors=sensors, notes=done) from None
+    if notes:
+        synthesis = replace(synthesis, notes=(*notes, *synthesis.notes))
+    progress("verifying the shipped realisation")
+    try:
+        return verified(plant, method.id, synthesis, name=name, recovery=recovery)
+    except VerificationError as error:
+        if not advise or error.report is None or {row.name for row in error.report.failures} != {CONSTANT_FAULT}:
+            raise
+        progress("searching for a method that estimates constant faults of this plant")
+        instead = _right_at_constant_faults(plant, method, name, recovery)
+        raise VerificationError(f"{error} {instead}", report=error.report) from None
 
 
 def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery: StateRecovery | None) -> str:

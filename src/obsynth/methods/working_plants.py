@@ -72,23 +72,48 @@ def working_plant(
         if transformation is None:
             return WorkingPlant(plant, recovery)
         progress("reducing the index")
-        notes = (f"{_reason(plant)}: {transformation.description}.", *notes)
-        if method is not None:
-            method, more = method_for_proper_form(plant, transformation, method)
-            notes = (*notes, *more)
-        return WorkingPlant(
-            transformation.plant,
-            _composed_recovery(recovery, transformation),
-            notes,
-            " ".join(notes),
-            transformation.dropped,
-            method,
-        )
+        return _in_proper_form(plant, recovery, method, transformation, notes)
     if not plant.is_sparse:
         return WorkingPlant(plant, recovery)
     progress("eliminating the algebraic states")
     transformation = eliminate_algebraic_states(plant)
     return WorkingPlant(transformation.plant, _composed_recovery(recovery, transformation), transformation.notes)
+
+
+def with_derivatives_as_inputs(
+    plant: Plant, recovery: StateRecovery | None, method: Method, working: WorkingPlant
+) -> WorkingPlant | None:
+    """Return the proper form of a plant that was taken as written, with derivatives of known inputs as inputs of their
+    own; ``None`` where none is needed, or the method does not exist for it."""
+    if not isinstance(plant, DescriptorSystem) or working.reduced or plant.nx > EXACT_ELIMINATION_UP_TO:
+        return None
+    if (structure_of(plant).index or 0) < 2 or method.is_for_states_as_written(plant):
+        return None
+    found = _with_input_derivatives(plant.dense())
+    if found is None or not _exists(found[0].plant, method):
+        return None
+    return _in_proper_form(plant, recovery, method, *found)
+
+
+def _in_proper_form(
+    plant: DescriptorSystem,
+    recovery: StateRecovery | None,
+    method: Method | None,
+    transformation: Transformation,
+    notes: tuple[str, ...],
+) -> WorkingPlant:
+    notes = (f"{_reason(plant)}: {transformation.description}.", *notes)
+    if method is not None:
+        method, more = method_for_proper_form(plant, transformation, method)
+        notes = (*notes, *more)
+    return WorkingPlant(
+        transformation.plant,
+        _composed_recovery(recovery, transformation),
+        notes,
+        " ".join(notes),
+        transformation.dropped,
+        method,
+    )
 
 
 def _composed_recovery(recovery: StateRecovery | None, transformation: Transformation) -> StateRecovery:
