@@ -97,6 +97,7 @@ class LearnedMonitorInC:
             f"    REAL raised_now[{max(inputs, 1)}];",
             "    int at, quiet, to_wait, alarmed, begun;",
             "    long taken;",
+            "    int decided;",
             f"}} {prefix}_monitor;",
             "",
         ]

@@ -44,6 +44,7 @@ static void monitor_reset(PREFIX_monitor *m)
     }
     m->at = 0;
     m->taken = 0;
+    m->decided = 0;
     m->to_wait = 0;
     m->statistic = NAN;
     m->alarm = m->event = m->quiet = m->alarmed = 0;
@@ -453,6 +454,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     REAL most = (REAL)HUGE_VAL;
     int known, i;
     m->taken += m->taken <= MONITOR_SETTLING;
+    m->decided = m->decided || deciding;
     for (i = 0; i < CHANNELS; i++) {
         x[i] = shown[monitor_places[i]];
         is_said = is_said && isfinite(x[i]);
@@ -484,7 +486,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     }
     m->to_wait -= m->to_wait > 0;
     /* What follows a warm-up is predicted from its last rows. */
-    is_said = is_whole || ((innovation >= 0 || !deciding) && (is_said || known));
+    is_said = is_whole || ((innovation >= 0 || !m->decided) && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
     if (deciding && m->taken > MONITOR_SETTLING) {

@@ -65,6 +65,7 @@ class LearnedState(NamedTuple):
     begun: int = 0  # rows since the start that say what is usual in this log, up to the last of `OWN_ROWS`
     own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults
     ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
+    decided: int = 0  # whether a row has been decided: the warm-up is over
 
 
 def follow_shares(memory: float) -> tuple[float, float]:
@@ -73,10 +74,10 @@ def follow_shares(memory: float) -> tuple[float, float]:
 
 
 class LearnedRule(Rule):
-    """The largest of all statistics in units of its level, row by row.  A row that is missing is as the autoregression
-    predicts it, and one in which nothing may be decided is only what the next ones are predicted from: neither adds
-    evidence, or takes any away.  Where the gain follows what is measured, a sample whose outputs say nothing by
-    themselves is decided so, too.
+    """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
+    be decided, is as the autoregression predicts it, and one of the warm-up is only what the next ones are predicted
+    from: none of them adds evidence, or takes any away.  Where the gain follows what is measured, a sample whose
+    outputs say nothing by themselves is decided so, too.
 
     Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
     moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
@@ -138,7 +139,7 @@ class LearnedRule(Rule):
         missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
         for _ in range(min(max(missing, 0), max(AGES))):
             state = self._added(state, None)
-        state = state._replace(last=sample.time, taken=state.taken + 1)
+        state = state._replace(last=sample.time, taken=state.taken + 1, decided=int(state.decided or sample.deciding))
         state = self._scored(state, sample.observation, max(missing, 0))
         if sample.deciding and state.taken > self.learned.settling:
             state = self._centred(state, sample.observation)
@@ -158,7 +159,7 @@ class LearnedRule(Rule):
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
         # What follows a warm-up is predicted from its last rows: from the mean, a slow estimate would come as a jump.
-        kept = varying or not sample.deciding
+        kept = varying or not state.decided
         if values_of_row is None or not (
             complete or (kept and (counts or np.isfinite(values_of_row[self._places]).all()))
         ):
