@@ -57,7 +57,7 @@ def test_export_samples_and_speaks_json(folder, capsys):
         ("wang2015", ["a.mat", "--sample-time", "1"], "sampled already"),
         ("filasova", ["a.c"], "continuous in time"),
         ("moussaali2013_ltv", ["a.mat"], "E, A, Phi may change with k"),
-        ("missing", ["a.mat"], "cannot be read"),
+        ("missing", ["a.mat"], "does not exist"),
     ],
 )
 def test_export_refuses(folder, capsys, gains, arguments, message):

@@ -311,8 +311,8 @@ class TestTampering:
                 load(file)
 
     def test_missing_file_and_folder(self, tmp_path):
-        for path in (tmp_path / "missing.json", tmp_path):
-            with pytest.raises(SpecError, match="cannot be read") as caught:
+        for path, why in ((tmp_path / "missing.json", "does not exist"), (tmp_path, "is a folder")):
+            with pytest.raises(SpecError, match=why) as caught:
                 load(path)
             assert caught.value.path == str(path)
 
