@@ -87,7 +87,7 @@ def with_advice(
     if not plant.nf and error.condition == "faults":
         # No sensor makes a fault of none.
         return error
-    without = [_without(name, method) for name, other in _at_default(method) if holds(plant, other)]
+    without = [words for words, other in _with_an_option_at_its_default(method) if holds(plant, other)]
     candidates = _as_noisy_as_others(plant, state_sensors(plant)) if sensors is None else sensors
     sets = () if without else least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if without:
@@ -110,22 +110,19 @@ def with_advice(
     )
 
 
-def _at_default(method: Method) -> Iterator[tuple[str, Method]]:
-    """Yield the method with one of its options at its default, for each option that a caller has changed."""
+def _with_an_option_at_its_default(method: Method) -> Iterator[tuple[str, Method]]:
+    """Yield, for each option that a caller has changed, the method with its default, and words for the difference."""
     for option in fields(method):
-        if option.default is MISSING or np.array_equal(getattr(method, option.name), option.default):
+        given, default = getattr(method, option.name), option.default
+        if default is MISSING or np.array_equal(given, default):
             continue
         try:
-            yield option.name, replace(method, **{option.name: option.default})
+            other = replace(method, **{option.name: default})
         except SpecError:
             # The other options need it.
             continue
-
-
-def _without(name: str, method: Method) -> str:
-    default = next(option.default for option in fields(method) if option.name == name)
-    given = "" if default is None else f" in place of {plain(getattr(method, name))!r}"
-    return f"without {name}" if default is None else f"with {name} {default!r}{given}"
+        words = f"with {option.name} {default!r} in place of {plain(given)!r}"
+        yield (f"without {option.name}" if default is None else words), other
 
 
 def _as_noisy_as_others(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> Sequence[Sensor]:

@@ -86,10 +86,8 @@ def _contents(
         return signals_of_dae(design, alarms), (text, declared), digest
     if isinstance(design.observer, ScheduledObserver):
         plant, observer = design.scheduled
-        alarms, seconds = (
-            scheduled_alarms(observer, thresholds, warm_up, monitor),
-            seconds_between_rows(observer, sample_time),
-        )
+        alarms = scheduled_alarms(observer, thresholds, warm_up, monitor)
+        seconds = seconds_between_rows(observer, sample_time)
         texts = scheduled_c_texts(design, PREFIX, header, alarms, seconds)
         source, declared = (in_precision(text, "double") for text in texts)
         return signals_of_scheduled(plant, observer, alarms, seconds), (source, declared), gain_set_digest(design)

@@ -72,7 +72,7 @@ def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
     if index != 1:
         return _without_rounding_passed(plant, fault_map, follower)
     answer = _answer(plant)
-    return follower._replace(T0=_product(follower.D, plant.C, answer))
+    return follower._replace(T0=_product_without_rounding(follower.D, plant.C, answer))
 
 
 def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
@@ -85,7 +85,9 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
     of_noise = None if weights is None or weights.noise is None else weights.noise[3]
     of_faults = None if weights is None or fault_map.exact else weights.faults
     ways = [(plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw)]
-    faults, disturbances, noise = (np.vstack([through, -_product(kernel, driven)]) for driven, through in ways)
+    faults, disturbances, noise = (
+        np.vstack([through, -_product_without_rounding(kernel, driven)]) for driven, through in ways
+    )
     models = [model for model in (of_faults, reference) if model is not None]
     passed = reduce(in_series, models)[3]
     faults = faults if of_faults is None else faults @ of_faults[3]
@@ -108,8 +110,8 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
     return follower._replace(D=rows[:, : plant.ny], T0=rows[:, plant.ny :] @ kernel)
 
 
-def _product(*factors: FloatArray) -> FloatArray:
-    """Return a product without entries that are rounding of its terms."""
+def _product_without_rounding(*factors: FloatArray) -> FloatArray:
+    """Return a product, its entries that are rounding of their terms set to zero."""
     entries, terms = reduce(np.matmul, factors), reduce(np.matmul, [np.abs(factor) for factor in factors])
     return np.where(np.abs(entries) > CANCELLATION_TOLERANCE * terms, entries, 0.0)
 

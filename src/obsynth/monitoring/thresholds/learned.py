@@ -45,6 +45,14 @@ LEARNED = FileKind(
 #: Share of healthy time in alarm above which thresholds do not hold.
 MOST_HEALTHY_TIME = 0.05
 
+#: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
+FAULTS_SLOWER = 2.0
+
+#: Thresholds of one log do not tell an offset of another log from a fault that is there from its first row on: an alarm
+#: that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is usual
+#: from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
+OWN_ROWS = (100, 200)
+
 
 class WrongPairs(NamedTuple):
     """Pairs of wrong samples in a row that count as not measured, as each of them would be an alarm."""
@@ -58,15 +66,6 @@ class WrongPairs(NamedTuple):
 
 
 NO_PAIRS = WrongPairs(0, 0.0)
-
-
-#: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
-FAULTS_SLOWER = 2.0
-
-#: Thresholds of one log do not tell an offset of another log from a fault that is there from its first row on: an alarm
-#: that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is usual
-#: from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
-OWN_ROWS = (100, 200)
 
 
 @dataclass(frozen=True, eq=False)
