@@ -152,3 +152,17 @@ def test_a_page_of_gains_that_fail_says_on_the_terminal_why_the_exit_code_is_6(
     told = capsys.readouterr()
     assert told.out == "Written: page.html\n"
     assert re.search(r"^Warning: wrong.gains.json: UNVERIFIED: \d+ of \d+ checks FAIL: ", told.err, re.MULTILINE)
+
+
+def test_notes_of_a_file_are_said_to_be_unverified(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A note is a sentence: "a fault of 1e-9 is certain to raise an alarm" was printed below "Verified"."""
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=0.1)
+    design = obsynth.ui_pi_observer(plant).replace(notes=("A fault of 1e-9 is certain to raise an alarm.",))
+    file, page = design.save(tmp_path / "a.gains.json"), tmp_path / "page.html"
+    for more in ([], ["-v"]):
+        assert main(["verify", str(file), *more]) == 0
+        said, _, notes = capsys.readouterr().out.partition("which verify does not check")
+        assert "is certain to raise" not in said
+        assert "is certain to raise" in notes
+    assert main(["report", "--gains", str(file), "--out", str(page)]) == 0
+    assert page.read_text().count("is certain to raise") == page.read_text().count("which verify does not check") == 1

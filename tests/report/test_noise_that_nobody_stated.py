@@ -49,3 +49,14 @@ def test_assumed_noise_is_called_so_and_stated_noise_is_not(tmp_path: Path) -> N
     assert "assumed" not in text
     # Noise by an option is stated, too.
     assert "white noise on 1 of 1 sensors" in printed(obsynth.functional_filter(SILENT, noise=1.0))
+
+
+@pytest.mark.parametrize("method", ["descriptor-kalman", "adaptive-observer"])
+def test_a_file_without_its_notes_calls_no_noise_stated(method: str) -> None:
+    """The sentence followed the notes: without them noise that nobody stated was stated."""
+    silent = obsynth.design(SILENT, method)
+    assert "Q = R = identity, because no noise was given" in printed(silent)
+    stripped = printed(silent.replace(notes=()))
+    assert "Q = R = identity" in stripped
+    assert "stated noise" not in stripped
+    assert "noise of the covariances Q and R" in printed(obsynth.design(SILENT, method, Q=0.1, R=0.2))

@@ -58,7 +58,7 @@ def run_design(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool) -> None:
+def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool, is_read: bool = False) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
     from obsynth.report.designs import design_report
     from obsynth.report.summary import print_summary, summary
@@ -66,9 +66,9 @@ def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool) 
 
     console = stdout_console()
     if verbose:
-        design_report(design, console=console)
+        design_report(design, console=console, is_read=is_read)
         console.print()
-    print_summary(summary(design, file=file, everything=verbose), console=console)
+    print_summary(summary(design, file=file, everything=verbose, is_read=is_read), console=console)
     if not verbose and not design.report.passed:
         console.print(checks_table(design.report.failures, width=console.width))
 
@@ -285,7 +285,7 @@ def _verify_gain_set(options: argparse.Namespace) -> int:
             "passed": report.passed,
             "report": report.as_dict(),
         },
-        lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
+        lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose, is_read=True),
     )
     return 0 if report.passed else VerificationError.exit_code
 

@@ -36,6 +36,9 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 from obsynth.results.registered import is_registered, registered
 
+#: What is said above the notes of a gain set that is read: they are sentences, which whoever holds the file may change.
+UNVERIFIED_NOTES = "Notes as they were written with the design, which verify does not check:"
+
 #: Signals of any kind of plant, as they are called here.
 _NAMES_OF_SIGNALS = {
     "states": "state_names",
@@ -104,8 +107,8 @@ def plant_facts(
             yield label, f"{len(names)}: {name_list(names)}" if names else "none"
 
 
-def design_report(design: ObserverDesign, *, console: Console) -> None:
-    """Print a design with its report."""
+def design_report(design: ObserverDesign, *, console: Console, is_read: bool = False) -> None:
+    """Print a design with its report; with ``is_read`` its notes are said to be those of its file."""
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "Claims", facts_table(promises(design)))
     if design.observer.fault_names:
@@ -126,6 +129,8 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
         console.print(Text(f"Tolerances: {facts[0][1]}"))
     elif facts:
         print_section(console, "Tolerances", facts_table(facts))
+    if design.notes and is_read:
+        console.print(Text(UNVERIFIED_NOTES))
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
 

@@ -13,6 +13,7 @@ from obsynth.files.tables import standing_page
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.report.designs import (
+    UNVERIFIED_NOTES,
     delay_curves,
     delay_table,
     fault_estimates,
@@ -130,7 +131,7 @@ def html_report(
         "Claims": [*fact_rows(promises(verified)), *_fault_estimates(verified), *_recovered(verified)],
         "Tolerances": list(fact_rows(facts)) if facts else [],
         "Noise against delay": list(_delay(verified)),
-        "Notes": list(listed(verified.notes)) if verified.notes else [],
+        "Notes": [f"<p>{UNVERIFIED_NOTES}</p>", *listed(verified.notes)] if verified.notes else [],
         "The plant": list(fact_rows(plant_facts(verified.plant))),
         "Checks": list(check_rows(verified.report.checks)) if verified.report.checks else [],
         "Gains": list(_gains(verified)),

@@ -58,7 +58,10 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
     if design.method == GuaranteedTestMethod.id:
         yield from _hidden(GuaranteedTest.of(design))
     if design.method == OptimalFilterMethod.id and len(OptimalFilter.of(design).trade_off) > 1:
-        text = "The least gain and the least deviation of any filter with an exact fault map against its delay."
+        text = (
+            "The least gain and the least deviation of any filter with an exact fault map against its delay, as the "
+            "search computed them; of this filter's own delay they are verified."
+        )
         yield Picture("Delay", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_delays(design, axes=axes[0])))
     if not isinstance(design.observer, LinearObserver):
         return

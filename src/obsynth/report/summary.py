@@ -30,10 +30,12 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.signal_names import listed
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import (
     FAR_FROM_ONE,
+    UNVERIFIED_NOTES,
     design_warnings,
     estimate_figures,
     fault_estimates,
@@ -87,6 +89,7 @@ class Summary:
     notes: tuple[str, ...]
     file: str = ""
     figures: tuple[Mapping[str, Any], ...] = ()
+    is_of_file: bool = False
 
     def lines(self, width: int = 80) -> Iterator[tuple[str, str]]:
         """Yield text and style of each line, none wider than ``width`` but the file's."""
@@ -99,6 +102,8 @@ class Summary:
             yield self.more, "dim"
         for text in self.warnings:
             yield from ((line, "yellow") for line in _wrapped("warning", text, width))
+        if self.notes and self.is_of_file:
+            yield from ((line, "") for line in textwrap.wrap(UNVERIFIED_NOTES, width))
         for text in self.notes:
             yield from ((line, "") for line in _wrapped("note", text, width))
         if self.file:
@@ -134,8 +139,12 @@ class Summary:
         }
 
 
-def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
-    """Return the summary of a design; with ``everything`` no fault and no note is left out."""
+def summary(
+    design: ObserverDesign, *, file: Path | None = None, everything: bool = False, is_read: bool = False
+) -> Summary:
+    """Return the summary of a design; with ``everything`` no fault and no note is left out.
+
+    ``is_read``: the design is read from ``file``, and its notes are whatever stands there."""
     gains = gains_if_linear(design)
     steps = followed_steps(design)
     headings, rows = fault_estimates(design, gains)
@@ -156,6 +165,7 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
         notes=notes,
         file="" if file is None else str(file),
         figures=tuple(estimate_figures(design, gains)),
+        is_of_file=is_read,
     )
 
 
@@ -299,7 +309,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     else:
         chosen = next(filter(None, map(_IDENTITY_NOTE.match, design.notes)), None)
         names = "" if chosen is None else " = ".join(chosen.group(1).split(" and "))
-        yield f"{names} = identity, because no noise was given" if names else "the stated noise"
+        yield f"{names} = identity, because no noise was given" if names else _noise_of_recursion(design)
     model = design.options.get("fault_model")
     of_states = bool(getattr(design.observer, "state_names", ())) and not design.observer.fault_names
     if isinstance(model, str) and not of_states:
@@ -312,6 +322,18 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
             yield "white noise of deviation 1 on every sensor, as none is stated"
             return
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise given"
+
+
+def _noise_of_recursion(design: ObserverDesign) -> str:
+    """Return which noise a recursive observer is for; a file that has lost its notes does not say who stated it."""
+    identities = [name for name in ("Q", "R") if _is_identity(getattr(design.observer, name, None))]
+    return f"{' = '.join(identities)} = identity" if identities else "noise of the covariances Q and R"
+
+
+def _is_identity(covariance: object) -> bool:
+    if isinstance(covariance, MatrixSequence):
+        covariance = covariance.at(0) if covariance.is_constant else None
+    return isinstance(covariance, np.ndarray) and np.array_equal(covariance, np.eye(len(covariance)))
 
 
 def _is_of_held_disturbances(design: ObserverDesign) -> bool:
