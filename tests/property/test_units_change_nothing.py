@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from flint import fmpq, fmpq_mat
 
-from obsynth import (
-    DescriptorSystem,
-    PreconditionError,
-    fault_estimation_filter,
-    pd_observer,
-    ui_pi_observer,
-)
+from obsynth import DescriptorSystem, PreconditionError, fault_estimation_filter, pd_observer, ui_pi_observer
 from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

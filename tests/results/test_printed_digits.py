@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from obsynth import (
-    DescriptorSystem,
-    ObserverDesign,
-    SpecError,
-    design_from_gains,
-    fault_estimation_filter,
-    verify,
-)
+from obsynth import DescriptorSystem, ObserverDesign, SpecError, design_from_gains, fault_estimation_filter, verify
 from obsynth.results.checks import Check
 
 sys.path.append(str(Path(__file__).parents[1] / "property"))

@@ -15,14 +15,7 @@ from dae_plants import DESIGNS, ROD, exchanger, linear, pendulum
 from test_dae_observer import matrices
 
 import obsynth
-from obsynth import (
-    DAEObserver,
-    ObserverDesign,
-    PreconditionError,
-    SpecError,
-    dae_adaptive_observer,
-    verify,
-)
+from obsynth import DAEObserver, ObserverDesign, PreconditionError, SpecError, dae_adaptive_observer, verify
 from obsynth.methods.dae_adaptive_observer import checks
 from obsynth.methods.designing import check
 from obsynth.observers.batches import run_dae_batch

@@ -8,10 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from corruption_tables import (
-    assert_every_row_is_broken,
-    assert_exactly_the_untrue_rows_fail,
-)
+from corruption_tables import assert_every_row_is_broken, assert_exactly_the_untrue_rows_fail
 
 from obsynth import Certificate, DescriptorSystem, ObserverDesign, functional_filter
 

@@ -26,15 +26,7 @@ from corruption_tables import (
     without_claim,
 )
 
-from obsynth import (
-    Certificate,
-    DescriptorSystem,
-    ObserverDesign,
-    SpecError,
-    design_from_gains,
-    pd_observer,
-    verify,
-)
+from obsynth import Certificate, DescriptorSystem, ObserverDesign, SpecError, design_from_gains, pd_observer, verify
 from obsynth.proofs.balls import Ball
 from obsynth.specs.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS

@@ -16,12 +16,7 @@ from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
 from obsynth.monitoring.thresholds.euler_rule import EulerRule
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
-from obsynth.monitoring.thresholds.learned_rule import (
-    FOLLOWED_MOST,
-    OWN_MOST,
-    LearnedRule,
-    follow_shares,
-)
+from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, OWN_MOST, LearnedRule, follow_shares
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk

@@ -9,9 +9,7 @@ import numpy as np
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import doubled_riccati_solution
-from obsynth.numerics.thin_doubling import (
-    FEWEST_STATES,
-)
+from obsynth.numerics.thin_doubling import FEWEST_STATES
 
 #: Residual of a Riccati equation that counts as solved, relative to its terms.
 EQUATION_TOLERANCE = 1e-8

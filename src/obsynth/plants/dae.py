@@ -15,12 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.expressions import (
-    DECIDING_WORDS,
-    FUNCTIONS,
-    FUNCTIONS_OF_TWO,
-    NAMED_NUMBERS,
-)
+from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
 from obsynth.numerics.libraries import imported
 from obsynth.plants.checking import Problems, checked_units
 from obsynth.plants.dae_checks import check_distinct, check_structure

@@ -23,12 +23,7 @@ from typing import Protocol
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.bernstein import (
-    MOST_DEGREE,
-    ProductCoefficient,
-    coefficients_on_pieces,
-    product_coefficients,
-)
+from obsynth.numerics.bernstein import MOST_DEGREE, ProductCoefficient, coefficients_on_pieces, product_coefficients
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block

@@ -10,14 +10,7 @@ from dataclasses import fields
 from functools import cache
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import (
-    Discriminator,
-    Field,
-    PlainValidator,
-    Tag,
-    ValidationInfo,
-    create_model,
-)
+from pydantic import Discriminator, Field, PlainValidator, Tag, ValidationInfo, create_model
 from pydantic_core import PydanticCustomError
 
 from obsynth.methods.registry import method_class

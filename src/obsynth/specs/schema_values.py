@@ -23,12 +23,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
 from obsynth.errors import counted
-from obsynth.numerics.arguments import (
-    NonNegative,
-    Positive,
-    is_number,
-    is_whole,
-)
+from obsynth.numerics.arguments import NonNegative, Positive, is_number, is_whole
 from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.specs.quantities import QUANTITY
 

@@ -16,9 +16,7 @@ from obsynth.monitoring.logs.measured_columns import constant_texts, never_measu
 from obsynth.monitoring.logs.signals import TIME_HEADER, missing_columns
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.monitoring.logs.unpacked_logs import as_frame
-from obsynth.numerics.arguments import (
-    require_kind,
-)
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import driven
 from obsynth.plants.descriptor import DescriptorSystem

@@ -22,14 +22,7 @@ from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import method_class
 from obsynth.monitoring.logs.log_run import faults_on_rows
 from obsynth.monitoring.thresholds.residual_model import largest_disturbances
-from obsynth.numerics.arguments import (
-    Count,
-    NonNegative,
-    Positive,
-    Probability,
-    arguments_checked,
-    is_finite_number,
-)
+from obsynth.numerics.arguments import Count, NonNegative, Positive, Probability, arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small

@@ -16,11 +16,7 @@ from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.report.plots.panels import (
-    data_url,
-    with_unit,
-    written,
-)
+from obsynth.report.plots.panels import data_url, with_unit, written
 from obsynth.results.certificate_files import result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict

@@ -25,11 +25,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.proofs.extended_balls import (
-    Enclosed,
-    block,
-    enclosed_eigenvalues,
-)
+from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
 from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import contraction_of
 

@@ -25,12 +25,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.ball_kernels import (
-    independent_columns,
-    pivots_of,
-    solution_with_free,
-    solution_with_one_free,
-)
+from obsynth.proofs.ball_kernels import independent_columns, pivots_of, solution_with_free, solution_with_one_free
 from obsynth.proofs.complex_balls import (
     adjoint,
     beside,

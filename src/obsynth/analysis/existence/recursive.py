@@ -15,22 +15,12 @@ from obsynth.analysis.existence.condition import Condition, rank_condition
 from obsynth.analysis.existence.identifiability import constant_plant, identifiability_condition
 from obsynth.analysis.existence.plant_numbers import SystemFacts
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside
-from obsynth.analysis.time_varying import (
-    HorizonRanks,
-    as_time_varying,
-    early_rows,
-    horizon_ranks,
-    step_blocks,
-)
+from obsynth.analysis.time_varying import HorizonRanks, as_time_varying, early_rows, horizon_ranks, step_blocks
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import are_outside
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import (
-    RANK_TOLERANCE,
-    numerical_rank,
-    real_but_rounding,
-)
+from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank, real_but_rounding
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem

@@ -13,12 +13,7 @@ from obsynth.analysis.existence.restricted_equivalent import with_sensor_faults_
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.checks_over_region import checks_over_region
-from obsynth.methods.fault_estimation_filter.printed_gains import (
-    gain_rows,
-    gains_fit,
-    printed_allowances,
-    weight_rows,
-)
+from obsynth.methods.fault_estimation_filter.printed_gains import gain_rows, gains_fit, printed_allowances, weight_rows
 from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares

@@ -12,11 +12,7 @@ import numpy as np
 from obsynth.conditions.gamma_lower_bound import BOUND_MARGIN, proved_lower_bound
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
-from obsynth.methods.fault_estimation_filter.small_gains import (
-    POLISHING_UP_TO,
-    PrintedInequality,
-    small_gain_design,
-)
+from obsynth.methods.fault_estimation_filter.small_gains import POLISHING_UP_TO, PrintedInequality, small_gain_design
 from obsynth.numerics.central_filter import AT_THE_BOUND, LeastGain, least_level, search_by_bisection, search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit
 

@@ -17,9 +17,7 @@ from obsynth.analysis.existence.functional_filter import residual_sets
 from obsynth.analysis.existence.functional_states import chosen_states, fixed_modes, state_goals, without_faults
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.functional_filter.assembly import FilterPart, assembled, filter_part
-from obsynth.methods.functional_filter.filter_models import (
-    with_noise_of_gains,
-)
+from obsynth.methods.functional_filter.filter_models import with_noise_of_gains
 from obsynth.methods.functional_filter.functional_observer import functional_part
 from obsynth.methods.functional_filter.kalman_gain import (
     RATE_REACHED,

@@ -17,12 +17,7 @@ from obsynth.methods.guaranteed_test.problem import (
     problem_as_designed,
     require_linear_options,
 )
-from obsynth.methods.guaranteed_test.proofs import (
-    proved_least,
-    proved_threshold,
-    repaired_multipliers,
-    repaired_point,
-)
+from obsynth.methods.guaranteed_test.proofs import proved_least, proved_threshold, repaired_multipliers, repaired_point
 from obsynth.methods.guaranteed_test.regions import remainder_check, while_inside
 from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
 from obsynth.methods.guaranteed_test.window_observers import (

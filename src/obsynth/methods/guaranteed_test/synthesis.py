@@ -23,12 +23,7 @@ from obsynth.methods.guaranteed_test.problem import (
     samples_given,
 )
 from obsynth.methods.guaranteed_test.programs import Optimum, largest_hidden_fault
-from obsynth.methods.guaranteed_test.proofs import (
-    proved_least,
-    proved_threshold,
-    repaired_multipliers,
-    repaired_point,
-)
+from obsynth.methods.guaranteed_test.proofs import proved_least, proved_threshold, repaired_multipliers, repaired_point
 from obsynth.methods.guaranteed_test.tolerant import (
     Beside,
     mean_over_record,

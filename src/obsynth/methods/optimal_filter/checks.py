@@ -10,12 +10,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import (
-    ZERO_GAIN,
-    FaultMap,
-    designed,
-    least_deviation_of_every_start,
-)
+from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed, least_deviation_of_every_start
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole

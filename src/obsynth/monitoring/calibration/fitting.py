@@ -9,12 +9,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.monitoring.calibration.diagnostics import OUTLYING, standing_out
-from obsynth.monitoring.calibration.innovations_fit import (
-    InnovationsFit,
-    box_beside,
-    chosen_timing,
-    innovations_fit,
-)
+from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, box_beside, chosen_timing, innovations_fit
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.likelihood import Likelihood
 from obsynth.monitoring.calibration.logs import RecordedLog, listed_rows

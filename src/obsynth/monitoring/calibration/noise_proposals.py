@@ -15,11 +15,7 @@ import numpy as np
 from obsynth.analysis.dae_structure import identifiability
 from obsynth.analysis.existence.moussaali_dae import NOMINAL_SAMPLES
 from obsynth.errors import SolverError
-from obsynth.monitoring.calibration.diagnostics import (
-    SIGNIFICANT,
-    mean_off,
-    whiteness,
-)
+from obsynth.monitoring.calibration.diagnostics import SIGNIFICANT, mean_off, whiteness
 from obsynth.monitoring.calibration.explanations import LEAST_EXPLANATION, regression_gain
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood

@@ -7,13 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from obsynth.monitoring.calibration.diagnostics import (
-    OUTLYING,
-    SIGNIFICANT,
-    Consistency,
-    Whiteness,
-    mean_off,
-)
+from obsynth.monitoring.calibration.diagnostics import OUTLYING, SIGNIFICANT, Consistency, Whiteness, mean_off
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.integration_error import IntegrationError
 from obsynth.monitoring.calibration.logs import EVEN, listed_rows

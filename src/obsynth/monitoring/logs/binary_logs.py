@@ -16,13 +16,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import reason
-from obsynth.monitoring.logs.signals import (
-    TIME_HEADER,
-    LogSignals,
-    column_of,
-    date_place,
-    status_places,
-)
+from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, column_of, date_place, status_places
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.unpacked_logs import channel_frame, mat_channels, npz_channels
 from obsynth.numerics.arrays import FloatArray

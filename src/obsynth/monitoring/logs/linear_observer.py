@@ -17,12 +17,7 @@ from obsynth.monitoring.thresholds.monitor import LinearSample
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.missing_samples import (
-    GAP_LEFT_SHARE,
-    KEPT_INTERVALS,
-    LEAST_SHOWN,
-    MissingSamples,
-)
+from obsynth.observers.linear.missing_samples import GAP_LEFT_SHARE, KEPT_INTERVALS, LEAST_SHOWN, MissingSamples
 from obsynth.observers.linear.modes import transient
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.plants.descriptor import DescriptorSystem

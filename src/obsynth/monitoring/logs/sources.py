@@ -15,14 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, reason, suffix_error
 from obsynth.monitoring.logs.binary_logs import NEEDED_PACKAGES, READERS, read_by_package
-from obsynth.monitoring.logs.signals import (
-    TIME_HEADER,
-    LogSignals,
-    date_place,
-    is_bad,
-    status_places,
-    with_date,
-)
+from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, date_place, is_bad, status_places, with_date
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.text_logs import WINDOWS_TEXT, no_text, number_in_cell, stream_rows, text_chunks
 from obsynth.monitoring.logs.unpacked_logs import (

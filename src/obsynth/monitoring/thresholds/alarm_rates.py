@@ -6,9 +6,7 @@ import math
 import re
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.thresholds.learned_levels import (
-    HOLD,
-)
+from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.numerics.arguments import is_finite_number
 
 #: Seconds of the units of time in which a rate is reported.

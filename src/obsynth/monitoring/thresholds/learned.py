@@ -13,9 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import path_of
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.thresholds.alarm_rates import UNITS
-from obsynth.monitoring.thresholds.cross_validation import (
-    HealthyTime,
-)
+from obsynth.monitoring.thresholds.cross_validation import HealthyTime
 from obsynth.monitoring.thresholds.learned_levels import (
     HOLD,
     RARER_WHERE_SIZES_LAST,

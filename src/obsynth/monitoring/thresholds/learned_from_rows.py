@@ -30,9 +30,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
     rows_needed,
 )
 from obsynth.monitoring.thresholds.learned_statistics import Statistics
-from obsynth.monitoring.thresholds.parameter_scores import (
-    Scores,
-)
+from obsynth.monitoring.thresholds.parameter_scores import Scores
 from obsynth.monitoring.thresholds.sensor_drifts import SensorDrifts, with_room_for_drifts
 from obsynth.monitoring.thresholds.watched_columns import settling_rows, watched_names
 from obsynth.numerics.arrays import FloatArray, read_only

@@ -29,12 +29,7 @@ from obsynth.monitoring.thresholds.normal_notes import (
     notes_of_sizes,
     notes_of_starts,
 )
-from obsynth.monitoring.thresholds.normal_output import (
-    NormalRuns,
-    ObserverOutput,
-    output_of_log,
-    output_of_normal_logs,
-)
+from obsynth.monitoring.thresholds.normal_output import NormalRuns, ObserverOutput, output_of_log, output_of_normal_logs
 from obsynth.monitoring.thresholds.range_rates import range_rates
 from obsynth.monitoring.thresholds.sensor_drifts import (
     DRIFT_ROWS,

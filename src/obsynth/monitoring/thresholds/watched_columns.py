@@ -9,9 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
-from obsynth.monitoring.thresholds.learned_levels import (
-    SETTLING,
-)
+from obsynth.monitoring.thresholds.learned_levels import SETTLING
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.changed_options import changed

@@ -20,12 +20,7 @@ from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delayed_signals import counted_at_reading, whole_samples_late
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
-from obsynth.plants.transformations.recovery import (
-    StateRecovery,
-    Transformation,
-    unchanged_states,
-    with_states,
-)
+from obsynth.plants.transformations.recovery import StateRecovery, Transformation, unchanged_states, with_states
 
 #: Polynomials of higher degree lose more digits than they gain in bandwidth.
 MOST_PADE_ORDER = 8
