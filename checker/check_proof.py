@@ -8,8 +8,8 @@ nothing is searched for, so an accepted claim is a theorem about the numbers of 
 proved; 1: one is not; 2: the file cannot be read.  The format is described in docs/explanation/proof_files.md.
 
 How to read this file (about an hour): sections 1 and 2 are the arithmetic and the one lemma on positive definite
-matrices; section 3 forms the error system; sections 4 and 5 have one function a claim, each with its proof in its
-docstring; section 6 reads the file and prints the verdicts.
+matrices; section 3 forms the error system; sections 4 and 6 have one function a claim, each with its proof in its
+docstring; section 5 does so for plants that change with parameters; section 7 reads the file and prints the verdicts.
 
 Notation: the plant is ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y = C x + D u + Df f + Dd d + Dw w``, where x+ is
 the next state or, with sample time zero, the derivative.  The observer is ``z+ = Az z + Bu u + By y``, and its rows are
@@ -481,18 +481,23 @@ def gain_is_below(system, claim):
 
 def require_bounded_real(system, claim, a, b, c, d):
     """Prove the bounded real inequality (see ``gain_is_below``) of a system for the gamma and the P of a claim."""
-    gamma, p = read_matrix(claim["gamma"]), read_matrix(claim["P"])
-    require(gamma.number() > 0, "gamma is not positive")
+    p = read_matrix(claim["P"])
     require(p.rows == a.rows, "P does not fit")
     require_positive_definite(p, claim["P_positive"], "P")
+    whole = bounded_real(system.discrete, read_matrix(claim["gamma"]), p, p, a, b, c, d)
+    require_positive_definite(whole, claim["bounded_real"], "the bounded real inequality")
+
+
+def bounded_real(discrete, gamma, p, after, a, b, c, d):
+    """Return the matrix of ``V(e) - V(e+) - |r|^2 + gamma^2 |s|^2``, V of P now and, in discrete time, of P after."""
+    require(gamma.number() > 0, "gamma is not positive")
     level = Matrix.identity(b.columns).times(gamma).times(gamma) - d.T @ d
-    if system.discrete:
-        corner, side = p - a.T @ p @ a - c.T @ c, -(a.T @ p @ b + c.T @ d)
-        level = level - b.T @ p @ b
+    if discrete:
+        corner, side = p - a.T @ after @ a - c.T @ c, -(a.T @ after @ b + c.T @ d)
+        level = level - b.T @ after @ b
     else:
         corner, side = -(a.T @ p + p @ a + c.T @ c), -(p @ b + c.T @ d)
-    whole = Matrix.blocks([[corner, side], [side.T, level]])
-    require_positive_definite(whole, claim["bounded_real"], "the bounded real inequality")
+    return Matrix.blocks([[corner, side], [side.T, level]])
 
 
 class Model:
@@ -606,16 +611,21 @@ def rounding_adds_little(system, claim):
         bounds = read_matrix(claim["bounds"][kind])
         contraction.require_bounds(bounds, found[moved][0], own[seen], kind)
         worst = max([worst, *entries_of(bounds)]) if kind != "disturbances" else worst
-        first = system.T.columns - system.Phi.rows
-        for i in system.rows_of(["fault"]) if kind == "states" else []:
-            for j in range(first, bounds.columns):
-                size = abs(system.goal.fraction(i, j))
-                require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
+        if kind == "states":
+            require_faults_are_seen(system, bounds)
     besides = ""
     if system.decoupled and system.Bd.columns:
         most = max(entries_of(read_matrix(claim["bounds"]["disturbances"])), default=0)
         besides = f"; disturbances, whatever their course, add at most {shown(most)} per unit"
     return f"rounding adds at most {shown(worst)} to any row, per unit of any state or input{besides}"
+
+
+def require_faults_are_seen(system, bounds):
+    """Refuse bounds per unit of a state by which an estimate could be another one than that of its fault's model."""
+    for i in system.rows_of(["fault"]):
+        for j in range(system.T.columns - system.Phi.rows, bounds.columns):
+            size = abs(system.goal.fraction(i, j))
+            require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
 
 
 def faults_are_estimated(system, claim):
@@ -745,7 +755,238 @@ def require_small(missed, sizes, share, floor, what):
             require(abs(missed.fraction(i, j)) <= allowed, f"{what}: entry {i + 1}, {j + 1} does not hold")
 
 
-# 5. Claims on windows of samples: guaranteed tests and alarms -------------------------------------------------------
+# 5. Claims over a region: plants and observers that change with parameters -------------------------------------------
+
+
+#: What a file has at each vertex, and of everything else once.
+SCHEDULED = {"plant": {"A", "B", "Bf", "Bd", "Bw"}, "observer": {"Az", "Bu", "By"}}
+
+
+class Region:
+    """The systems at the vertices of a region, of which plant and observer are means with weights of any course.
+
+    With weights ``w_i >= 0`` of sum one, which may change in any way from sample to sample, the plant has
+    ``A(w) = sum of w_i A_i``, and likewise Bu, Bf, Bd and Bw; the observer, with the same weights at the same sample,
+    has Az(w), Bu(w) and By(w).  All else (E, T and what outputs and rows are of states and signals) does not change, so
+    that what ``System.identities`` and ``System.driven`` form is the mean of what they form at the vertices.
+
+    In continuous time there is one Lyapunov matrix; in discrete time one, or one for each vertex.  Then
+    ``V = e' P(w) e`` with ``P(w) = sum of w_i P_i``, and each inequality, which has P_i of the vertex i now and P_j of
+    the next sample, is asked for every i and j.  For one j it is concave in the matrices of the error system, as P_j is
+    positive definite, and linear in P_i: it holds for all means over i, and these hold for all means over j.
+    """
+
+    def __init__(self, file):
+        require(isinstance(file["vertices"], list) and file["vertices"], "there are no vertices")
+        self.systems = []
+        for vertex in file["vertices"]:
+            parts = {}
+            for kind, names in SCHEDULED.items():
+                require(set(vertex[kind]) == names, f"a vertex has exactly {', '.join(sorted(names))} of the {kind}")
+                require(not names & set(file[kind]), f"a matrix of the {kind} is at the vertices and beside them")
+                parts[kind] = {**file[kind], **vertex[kind]}
+            self.systems.append(System({**file, **parts}))
+        first = self.systems[0]
+        require(first.T0.is_zero() and not first.lag, "over a region the rows add no equations and no past states")
+        self.first, self.discrete, self.count = first, first.discrete, len(self.systems)
+        self.witness, self.proved_contraction = file.get("contraction"), None
+        self.words = f", for every course of the weights of the {self.count} vertices, jumps among them"
+
+    def contraction(self):
+        """Return the contraction of the file, proved once."""
+        if self.proved_contraction is None:
+            require(self.witness is not None, "the file has no contraction")
+            self.proved_contraction = RegionContraction(self, self.witness)
+        return self.proved_contraction
+
+    def lyapunov_matrices(self, claim):
+        """Return the positive definite P: one, or in discrete time one for each vertex."""
+        order, most = self.first.Az.rows, self.count if self.discrete else 1
+        matrices = [read_matrix(given) for given in claim["P"]]
+        require(len(matrices) in (1, most), "there is one P, or one for each vertex of a sampled plant")
+        for p, witness in zip(matrices, claim["P_positive"], strict=True):
+            require(p.rows == order, "P does not fit")
+            require_positive_definite(p, witness, "P")
+        return matrices
+
+    def require_at_all_pairs(self, matrices, witnesses, form, what):
+        """Prove that ``form(system at i, P_i, P_j)`` is positive definite for every vertex i and next vertex j."""
+        nexts = matrices if self.discrete else matrices[:1]
+        needed = [(i, j) for i in range(self.count) for j in range(len(nexts))]
+        require(len(witnesses) == len(needed), f"{what}: there is not a witness for each vertex and next vertex")
+        for (i, j), witness in zip(needed, witnesses, strict=True):
+            own = matrices[i] if len(matrices) > 1 else matrices[0]
+            name = f"{what}, vertex {i + 1}" + (f", then {j + 1}" if len(nexts) > 1 else "")
+            require_positive_definite(form(self.systems[i], own, nexts[j]), witness, name)
+
+    def lyapunov(self, claim, rate):
+        """Prove that ``e' P(w) e`` decreases faster than ``rate^(2k)`` or ``exp(-2 rate t)``; return the P."""
+        matrices = self.lyapunov_matrices(claim)
+
+        def form(system, p, after):
+            if self.discrete:
+                return p.times(rate).times(rate) - system.Az.T @ after @ system.Az
+            half = system.Az.T @ p + p.times(rate)
+            return -(half + half.T)
+
+        self.require_at_all_pairs(matrices, claim["decreases"], form, "the Lyapunov inequality")
+        return matrices
+
+
+class RegionContraction:
+    """What columns k_i of inputs at the vertices do to a row: as ``Contraction``, with ``|e|^2 = e' P(w) e``.
+
+    The norm of k(w) in P(w+) is at most the largest of ``k_i' P_j k_i``: it is convex in k, and linear in P.  One G
+    with ``[P_j, I; I, G] > 0`` for every j is above the inverse of P(w).
+    """
+
+    def __init__(self, region, witness):
+        rate, one = read_matrix(witness["rate"]), Matrix.identity(region.first.Az.rows)
+        value = rate.number()
+        require(0 < value < 1 if region.discrete else value > 0, "the rate is none of decay")
+        self.matrices, g = region.lyapunov(witness, rate), read_matrix(witness["G"])
+        for p, covers in zip(self.matrices, witness["G_covers"], strict=True):
+            require_positive_definite(Matrix.blocks([[p, one], [one, g]]), covers, "G")
+        self.slowness, rows = (1 - value if region.discrete else value), region.first.Cz
+        self.heights = [(rows.part([i]) @ g @ rows.part([i]).T).number() for i in range(rows.rows)]
+
+    def require_bounds(self, bounds, each_columns, each_own, what):
+        """Refuse unless each bound is at least its largest own part, and what any of the columns adds to it."""
+        first = each_own[0]
+        require((bounds.rows, bounds.columns) == (first.rows, first.columns), f"the bounds for {what} do not fit")
+        for j in range(first.columns):
+            columns = [columns.part(None, [j]) for columns in each_columns]
+            length = max((column.T @ p @ column).number() for column in columns for p in self.matrices)
+            for i in range(first.rows):
+                left = bounds.fraction(i, j) - max(own.fraction(i, j) for own in each_own)
+                require(
+                    left >= 0 and (left * self.slowness) ** 2 >= self.heights[i] * length,
+                    f"the bound of row {i + 1} and column {j + 1} for {what} is not proved",
+                )
+
+
+def identities_hold_over_region(region, claim):
+    """The identities (see ``identities_hold``) hold at every vertex, and so for all means of them."""
+    sentences = [identities_hold(system, claim) for system in region.systems]
+    return sentences[0] + region.words
+
+
+def decays_over_region(region, claim):
+    """Errors decay: a Lyapunov inequality with a rate below one or, in continuous time, not below zero."""
+    rate = read_matrix(claim["rate"])
+    value = rate.number()
+    require(0 < value < 1 if region.discrete else value > 0, "the rate is none of decay")
+    region.lyapunov(claim, rate)
+    factor = f"(1 - {shown(1 - value, down=True)})^k" if region.discrete else f"exp(-{shown(value, down=True)} t)"
+    return f"errors decay faster than {factor}, up to a constant factor{region.words}"
+
+
+def gain_is_below_over_region(region, claim):
+    """The l2 gain from a signal to the errors of some rows is below gamma: the bounded real lemma with V of P(w)."""
+    rows, gamma, matrices = region.first.rows_of_each(claim["rows"]), claim["gamma"], region.lyapunov_matrices(claim)
+
+    def form(system, p, after):
+        b, d = system.driven(claim["signal"])
+        c, d = -system.Cz.part(rows), d.part(rows)
+        return bounded_real(region.discrete, read_matrix(gamma), p, after, system.Az, b, c, d)
+
+    region.require_at_all_pairs(matrices, claim["bounded_real"], form, "the bounded real inequality")
+    return (
+        f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below "
+        f"{shown(read_matrix(gamma).number())}{region.words}"
+    )
+
+
+def mean_square_is_below(region, claim):
+    """Under white noise of unit variance the errors of some rows have together at most this root mean square.
+
+    The mean of ``V(e+)`` is that of ``e' a' P(w+) a e``, and ``tr b' P(w+) b``, as e depends on earlier noise alone.
+    If ``a' P(w+) a + c'c < P(w)`` and ``tr b' P(w+) b + tr d'd <= level^2``, then ``|r|^2`` has at most the mean
+    ``level^2 + V(e) - V(e+)``, and averaged over more and more samples at most ``level^2``.
+    """
+    require(region.discrete, "the claim is for sampled plants")
+    rows, matrices = region.first.rows_of_each(claim["rows"]), region.lyapunov_matrices(claim)
+    c, level = region.first.Cz.part(rows), read_matrix(claim["level"]).number()
+    require(level > 0, "the level is not positive")
+
+    def form(system, p, after):
+        return p - system.Az.T @ after @ system.Az - c.T @ c
+
+    region.require_at_all_pairs(matrices, claim["decreases"], form, "the inequality of the mean square")
+    for system in region.systems:
+        b, d = system.driven("noise")
+        direct = trace(d.part(rows).T @ d.part(rows))
+        for after in matrices:
+            require(trace(b.T @ after @ b) + direct <= level**2, "the mean square is not proved")
+    return (
+        f"the errors of the {' and '.join(claim['rows'])} rows, averaged over the samples in the long run, have "
+        f"together a root mean square of at most {shown(level)} under white noise as modelled, which the parameters do "
+        f"not depend on{region.words}"
+    )
+
+
+def trace(matrix):
+    """Return the sum of the diagonal."""
+    return sum((matrix.fraction(i, i) for i in range(matrix.rows)), Fraction(0))
+
+
+def rounding_adds_little_over_region(region, claim):
+    """What rounding of the stored numbers adds to each row, see ``rounding_adds_little``; J, L and W do not change."""
+    contraction, found, worst = region.contraction(), [system.identities() for system in region.systems], Fraction(0)
+    pairs = {"states": ("K", "J"), "inputs": ("U", "L")}
+    pairs |= {"disturbances": ("V", "W")} if region.first.decoupled else {}
+    require(set(claim["bounds"]) == set(pairs), "there are not bounds for each kind of signal")
+    for kind, (moved, seen) in pairs.items():
+        bounds, own = read_matrix(claim["bounds"][kind]), [each[seen][0].absolute() for each in found]
+        contraction.require_bounds(bounds, [each[moved][0] for each in found], own, kind)
+        worst = max([worst, *entries_of(bounds)])
+        if kind == "states":
+            require_faults_are_seen(region.first, bounds)
+    return f"rounding adds at most {shown(worst)} to any row, per unit of any {', '.join(pairs)}{region.words}"
+
+
+def faults_are_estimated_over_region(region, claim):
+    """A fault of any course shows in its own estimate one sample later, and in no other row, but for rounding.
+
+    A fault impulse leaves ``b_j`` in e, with weights of all j, and ``a_i b_j`` a sample later: row r responds with d at
+    once and with ``-c b_j`` after a sample, which should be one where r is named like the fault and zero elsewhere.
+    What is left after that starts with the columns ``a_i b_j`` (see ``RegionContraction``).
+    """
+    require(region.discrete, "the claim is for sampled filters")
+    system, bounds, moved, own = region.first, read_matrix(claim["bounds"]), [], []
+    delays = {name: delay for kind, name, delay in system.row_kinds if kind == "fault"}
+    require(set(delays) == set(system.names["faults"]), "not every fault is estimated")
+    require(len(delays) == len(system.rows_of(["fault"])), "a fault has two estimates")
+    require(set(delays.values()) == {1}, "over a region a fault is estimated a sample later")
+    wanted = Matrix.zero(system.Cz.rows, system.Bf.columns)
+    for i, (kind, name, _) in enumerate(system.row_kinds):
+        if kind in ("fault", "residual") and name in delays:
+            wanted.entries[i][system.index("faults", name)] = 1
+    for one in region.systems:
+        b, d = one.driven("faults")
+        own.append(d.absolute() + (system.Cz @ b + wanted).absolute())
+        moved += [other.Az @ b for other in region.systems]
+    region.contraction().require_bounds(bounds, moved, own, "faults")
+    for i in system.rows_of(["fault"]):
+        require(bounds.fraction(i, system.index("faults", system.row_kinds[i][1])) <= LARGEST_SHARE, NOT_ITS_FAULT)
+    return (
+        f"each fault is estimated as it was a sample ago, and shows nowhere else, to {shown(max(entries_of(bounds)))} "
+        f"per unit of it{region.words}"
+    )
+
+
+#: Claims of files with vertices.
+REGION_CLAIMS = {
+    "identities over the region": identities_hold_over_region,
+    "decay over the region": decays_over_region,
+    "rounding over the region": rounding_adds_little_over_region,
+    "gain over the region": gain_is_below_over_region,
+    "mean square over the region": mean_square_is_below,
+    "faults over the region": faults_are_estimated_over_region,
+}
+
+
+# 6. Claims on windows of samples: guaranteed tests and alarms -------------------------------------------------------
 
 
 class Window:
@@ -1148,7 +1389,10 @@ def alarm_is_right(system, claim):
 #: What reading a file raises that is not what the format says.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 #: Claims on the error system: they are about the observer's errors only where the identities hold.
-REST_ON_IDENTITIES = ("gain", "matching", "deviation", "faults", "fault models")
+REST_ON_IDENTITIES = (
+    *("gain", "matching", "deviation", "faults", "fault models"),
+    *("gain over the region", "mean square over the region", "faults over the region"),
+)
 CLAIMS = {
     "plant": plant_follows,
     "identities": identities_hold,
@@ -1165,7 +1409,7 @@ CLAIMS = {
 }
 
 
-# 6. Reading, and verdicts -------------------------------------------------------------------------------------------
+# 7. Reading, and verdicts -------------------------------------------------------------------------------------------
 
 
 def read_integer(value):
@@ -1206,21 +1450,23 @@ def check(file):
     require(isinstance(file, dict), "this is no proof file")
     require(file.get("format") == FORMAT, "this is no proof file")
     require(read_integer(file.get("version")) == VERSION, f"the version of the file is not {VERSION}")
-    system, left = System(file), file.get("not_covered", [])
+    over_region, left = "vertices" in file, file.get("not_covered", [])
+    about, claims = (Region(file), REGION_CLAIMS) if over_region else (System(file), CLAIMS)
     require(isinstance(file["claims"], list) and file["claims"], "there are no claims")
     require(isinstance(left, list), "what is not covered is no list")
     verdicts = []
     for claim in file["claims"]:
         name = str(claim.get("claim"))
         try:
-            require(name in CLAIMS, "this program knows no such claim: it is not proved")
-            verdicts.append((name, True, CLAIMS[name](system, claim)))
+            require(name in claims, "this program knows no such claim: it is not proved")
+            verdicts.append((name, True, claims[name](about, claim)))
         except Refused as refused:
             verdicts.append((name, False, str(refused)))
         except UNREADABLE as error:
             verdicts.append((name, False, f"the claim cannot be read: {type(error).__name__} {error}"))
-    follows = any(name == "identities" and proved for name, proved, _ in verdicts)
-    missing = "it is about errors only where the claim 'identities' is proved, too"
+    identities = "identities over the region" if over_region else "identities"
+    follows = any(name == identities and proved for name, proved, _ in verdicts)
+    missing = f"it is about errors only where the claim '{identities}' is proved, too"
     verdicts = [
         (name, False, missing) if proved and name in REST_ON_IDENTITIES and not follows else (name, proved, text)
         for name, proved, text in verdicts
@@ -1263,9 +1509,8 @@ def main(arguments):
         print(on_one_line(f"{'PROVED' if proved else 'NOT PROVED'}  {name}: {text}"))
     for text in left:
         print(on_one_line(f"NOT COVERED by this file: {text}"))
-    print(
-        f"NOT CLAIMED by this file: {', '.join(sorted(set(CLAIMS) - {name for name, _, _ in verdicts})) or 'nothing'}"
-    )
+    known = REGION_CLAIMS if "vertices" in file else CLAIMS
+    print(f"NOT CLAIMED by this file: {', '.join(sorted(set(known) - {name for name, _, _ in verdicts})) or 'nothing'}")
     if all(proved for _, proved, _ in verdicts):
         print(f"All {len(verdicts)} claims are proved, for the numbers in this file.")
         return 0

@@ -9,7 +9,7 @@ as the inequality needs: any approximate solution that satisfies it is a proof.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -90,6 +90,16 @@ class Dyadic:
     def rows(self) -> list[list[int]]:
         """Return the integers row by row."""
         return [[int(value) for value in row] for row in self.integers.tolist()]
+
+    def rows_at(self, places: Iterable[int]) -> Dyadic:
+        """Return some rows."""
+        integers = self.integers.tolist()
+        chosen = [integers[i] for i in places]
+        return Dyadic(fmpz_mat(len(chosen), self.shape[1], [value for row in chosen for value in row]), self.exponent)
+
+    def columns_from(self, first: int) -> Dyadic:
+        """Return the columns from one on."""
+        return self.T.rows_at(range(first, self.shape[1])).T
 
     def fraction(self, i: int, j: int) -> Fraction:
         """Return one entry."""

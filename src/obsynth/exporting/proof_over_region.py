@@ -1,0 +1,409 @@
+"""Proof files of designs over a region: the claims at all vertices, with one Lyapunov matrix or one for each vertex.
+
+What is written here is what section 5 of ``checker/check_proof.py`` asks for.  Lyapunov matrices are those of the
+certificate; slack matrices beside them are not needed, as what they prove holds without them.  What they prove for
+parameters that change slowly only is not covered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.exporting.exact_error_system import (
+    BOUND_ROOM,
+    CONTRACTION_SHARES,
+    ESTIMATE_SHARE,
+    NORM_ROOM,
+    OBSERVER_MATRICES,
+    PLANT_MATRICES,
+    RATE_SHARE,
+    ExactErrorSystem,
+    exact,
+    identities_claim,
+    matrix_data,
+    rows_of,
+)
+from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.witnesses import Dyadic, blocks, definite_witness, inverse_above, number_data, root_above
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES
+
+#: Matrices that a file has at each vertex.
+SCHEDULED_OF_PLANT, SCHEDULED_OF_OBSERVER = ("A", "B", "Bf", "Bd", "Bw"), ("Az", "Bu", "By")
+#: What the inverse of a mean of Lyapunov matrices is multiplied by, to be above the inverse of each.
+COVERING_FACTORS = (1.0, 2.0, 4.0, 16.0, 256.0, 65536.0)
+#: What every file of a region leaves to `obsynth.verify`.
+ALWAYS_LEFT = (
+    "that the plant with its parameters is a mean of these vertices: `obsynth verify` forms them from the ranges",
+    "rows whose parameters are outside their ranges or missing",
+)
+#: Claims of the methods that the file may prove: name, Lyapunov matrix, signal and kind of rows.
+GAINS = {
+    "fault-estimation-filter": ("gamma", WITNESSES[0], "disturbances", "fault"),
+    "ui-pi-observer": ("region_gain", GAIN_WITNESSES[0], "fault model", "fault"),
+}
+
+
+def refusal_over_region(design: ObserverDesign) -> str:
+    """Return why a design over a region has no proof file; empty where it has one."""
+    if not isinstance(design.plant, PolytopicSystem) or not isinstance(design.observer, ScheduledObserver):
+        return "it is for a nonlinear plant"
+    if design.observer.correction is not None:
+        return "its faults turn their directions, and it corrects its state by its residuals"
+    if not design.plant.is_constant("E", "C", "D", "Df", "Dd", "Dw"):
+        return "its outputs change with the parameters"
+    return ""
+
+
+@dataclass
+class RegionProof:
+    """Collects the claims of a scheduled design, and the names of those that are left out."""
+
+    design: ObserverDesign
+    claims: list[dict[str, Any]] = field(default_factory=list)
+    not_covered: list[str] = field(default_factory=list)
+    witness: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if reason := refusal_over_region(self.design):
+            raise SpecError(
+                f"Design {self.design.name!r} has no proof file: {reason}. `obsynth verify` checks it.", path="design"
+            )
+
+    @cached_property
+    def observer(self) -> ScheduledObserver:
+        """The observer, of which fault rows are not divided by their effectiveness."""
+        return self.design.scheduled[1]
+
+    @cached_property
+    def plants(self) -> list[DescriptorSystem]:
+        """The plant at the vertices; of a Kalman filter with the noise that it is for."""
+        plant = self.design.scheduled[0]
+        if self.design.method != "descriptor-kalman":
+            return list(plant.vertices)
+        options = self.design.options
+        noise = NoiseOverRegion.of(plant, options.get("Q"), options.get("R"))
+        V = noise.sensor
+        return [
+            vertex.replace(
+                Bw=np.hstack([W, np.zeros((plant.nx, V.shape[1]))]),
+                Dw=np.hstack([np.zeros((plant.ny, W.shape[1])), V]),
+                noise_names=None,
+            )
+            for vertex, W in zip(plant.vertices, noise.process, strict=True)
+        ]
+
+    @cached_property
+    def systems(self) -> list[ExactErrorSystem]:
+        """The error system at each vertex, in exact numbers."""
+        matrices = self.design.certificate.matrices
+        decoupled = self.design.method != "fault-estimation-filter"
+        systems = []
+        for place, plant in enumerate(self.plants):
+            own = self.observer.before_division(place)
+            model = ErrorModel(
+                plant, own, matrices["tracking"], Phi=matrices.get("Phi"), Cw=matrices.get("Cw"), decoupled=decoupled
+            )
+            systems.append(ExactErrorSystem.of(plant, own, model))
+        return systems
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the plant is sampled."""
+        return self.observer.dt > 0.0
+
+    def data(self) -> dict[str, Any]:
+        """Return plant, observer and claims as data of the file, without what every proof file has."""
+        first, (plant, _) = self.systems[0], self.design.scheduled
+        model = first.model
+        follows = {
+            "T": model.T,
+            "T0": np.zeros((len(first.observer.Cz), len(model.E))),
+            "Phi": np.zeros((0, 0)) if model.Phi is None else model.Phi,
+            "Cw": np.zeros((plant.nf, 0)) if model.Cw is None else model.Cw,
+        }
+        names = {"states": plant.state_names, "faults": plant.fault_names, "disturbances": plant.disturbance_names}
+        fixed = [name for name in PLANT_MATRICES if name not in SCHEDULED_OF_PLANT]
+        rows = [name for name in OBSERVER_MATRICES if name not in SCHEDULED_OF_OBSERVER]
+        return {
+            "plant": {
+                **{name: matrix_data(getattr(first.plant, name)) for name in fixed},
+                "sample_time": number_data(plant.dt),
+                "names": {kind: list(each) for kind, each in names.items()},
+            },
+            "observer": {
+                **{name: matrix_data(getattr(first.observer, name)) for name in rows},
+                "rows": [list(row) for row in rows_of(first.observer)],
+            },
+            "vertices": [
+                {
+                    "plant": {name: matrix_data(getattr(system.plant, name)) for name in SCHEDULED_OF_PLANT},
+                    "observer": {name: matrix_data(getattr(system.observer, name)) for name in SCHEDULED_OF_OBSERVER},
+                }
+                for system in self.systems
+            ],
+            "follows": {
+                **{name: matrix_data(value) for name, value in follows.items()},
+                "lag": 0,
+                "decoupled": model.decoupled,
+            },
+            "contraction": self.witness,
+            "claims": self.claims,
+            "not_covered": self.not_covered,
+        }
+
+    def collect(self) -> None:
+        """Write every claim that can be proved, and name the others."""
+        missed = [(name, part) for system in self.systems for name, part in system.missed.items()]
+        self._add(
+            "the identities hold to less than a thousandth of their terms",
+            identities_claim("identities over the region", missed),
+        )
+        self._add_decay()
+        if self.design.method == "descriptor-kalman":
+            self._add_mean_square()
+        if self.observer.effectiveness_is_one:
+            self._add_gain()
+        else:
+            self.not_covered.append(
+                "the gain and the faults' own estimates: fault rows are divided by an effectiveness that changes"
+            )
+        self.not_covered += ALWAYS_LEFT
+        if not self.discrete:
+            self.not_covered.append("the steps of implicit Euler by which the observer runs")
+        if self.design.source is not None:
+            self.not_covered.append(
+                "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
+            )
+
+    def _add(self, name: str, claim: Mapping[str, Any] | None) -> None:
+        if claim is None:
+            self.not_covered.append(name)
+        else:
+            self.claims.append(dict(claim))
+
+    def _lyapunov_matrices(self, name: str) -> list[Dyadic] | None:
+        """Return the Lyapunov matrices of the certificate: one, or one for each vertex of a sampled plant."""
+        stored = self.design.certificate.matrices.get(name)
+        order = self.observer.order
+        if stored is None or stored.ndim != 3 or stored.shape[1:] != (order, order):
+            return None
+        if len(stored) not in (1, self.observer.count if self.discrete else 1):
+            return None
+        return [exact(0.5 * (P + P.T)) for P in stored]
+
+    def _at_all_pairs(
+        self, matrices: Sequence[Dyadic], form: Callable[[ExactErrorSystem, Dyadic, Dyadic], Dyadic]
+    ) -> list[dict[str, Any]] | None:
+        """Return witnesses that a form is positive definite at each vertex, for each Lyapunov matrix of the next."""
+        witnesses = []
+        for i, system in enumerate(self.systems):
+            for after in matrices:
+                own = matrices[i] if len(matrices) > 1 else matrices[0]
+                if (witness := definite_witness(form(system, own, after))) is None:
+                    return None
+                witnesses.append(witness)
+        return witnesses
+
+    def _of_matrices(self, matrices: Sequence[Dyadic]) -> dict[str, Any] | None:
+        positive = [definite_witness(P) for P in matrices]
+        return None if None in positive else {"P": [P.data() for P in matrices], "P_positive": positive}
+
+    def _decaying(self, matrices: Sequence[Dyadic], rate: float) -> dict[str, Any] | None:
+        def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic) -> Dyadic:
+            if self.discrete:
+                return p.scaled(rate).scaled(rate) - system.az.T @ after @ system.az
+            half = system.az.T @ p + p.scaled(rate)
+            return -(half + half.T)
+
+        witnesses, stated = self._at_all_pairs(matrices, form), self._of_matrices(matrices)
+        if witnesses is None or stated is None:
+            return None
+        return {"rate": number_data(rate), **stated, "decreases": witnesses}
+
+    def _add_decay(self) -> None:
+        matrices, decay = self._lyapunov_matrices(WITNESSES[0]), self.design.certificate.claims.get("region_decay", 0.0)
+        slowness = 1.0 - decay if self.discrete else decay
+        found = None
+        for share in (1.0, 1.0 - RATE_SHARE) if matrices is not None and slowness > 0.0 else ():
+            rate = 1.0 - share * slowness if self.discrete else share * slowness
+            found = found or self._decaying(matrices or [], rate)
+        name = "decay: it is proved for parameters that change slowly" if self._is_slow else "decay over the region"
+        self._add(name, None if found is None else {"claim": "decay over the region", **found})
+        contraction = None if matrices is None else self._contraction(matrices, slowness)
+        if contraction is None:
+            self.not_covered.append("what rounding of stored numbers adds: no contraction was found")
+            return
+        self._add("what rounding of stored numbers adds: too much for an estimate", self._rounding(contraction))
+        if self.design.method == "fault-estimation-filter" and self.observer.effectiveness_is_one:
+            self._add("each fault's own estimate: rounding may hide it", self._faults(contraction))
+
+    @property
+    def _is_slow(self) -> bool:
+        """Whether the parameters have rates: what is proved with these need not hold for jumps."""
+        return bool(self.design.scheduled[0].scheduling.rates)
+
+    def _contraction(self, matrices: Sequence[Dyadic], slowness: float) -> _RegionContraction | None:
+        """Return a contraction with the Lyapunov matrices of the decay, and write its data."""
+        for share in CONTRACTION_SHARES if slowness > 0.0 else ():
+            rate = 1.0 - share * slowness if self.discrete else share * slowness
+            witness = self._decaying(matrices, rate)
+            covering = None if witness is None else _above_inverses(matrices)
+            if witness is None or covering is None:
+                continue
+            G, covers = covering
+            self.witness = {**witness, "G": G.data(), "G_covers": covers}
+            own = 1 - Fraction(rate) if self.discrete else Fraction(rate)
+            return _RegionContraction(self.systems[0].cz, matrices, G, own)
+        return None
+
+    def _rounding(self, contraction: _RegionContraction) -> dict[str, Any] | None:
+        missed = [system.missed for system in self.systems]
+        pairs = {"states": ("K", "J"), "inputs": ("U", "L")}
+        pairs |= {"disturbances": ("V", "W")} if self.systems[0].model.decoupled else {}
+        bounds = {
+            kind: contraction.bounds([each[moved][0] for each in missed], [each[seen][0].absolute() for each in missed])
+            for kind, (moved, seen) in pairs.items()
+        }
+        model, rows = self.systems[0].model, self.observer.fault_rows
+        if model.Phi is not None and len(model.Phi):
+            goal = np.abs(model.goal[rows, -len(model.Phi) :])
+            if np.any((goal > 0.0) & (bounds["states"][rows, -len(model.Phi) :] > ESTIMATE_SHARE * goal)):
+                return None
+        return {
+            "claim": "rounding over the region",
+            "bounds": {kind: matrix_data(bound) for kind, bound in bounds.items()},
+        }
+
+    def _faults(self, contraction: _RegionContraction) -> dict[str, Any] | None:
+        """Return that each fault shows in its own estimate a sample later, and nowhere else."""
+        first, names = self.systems[0], self.design.scheduled[0].fault_names
+        rows = rows_of(first.observer)
+        if not names or {delay for kind, _, delay in rows if kind == "fault"} != {1}:
+            return None
+        wanted = np.zeros((len(rows), len(names)))
+        for i, (kind, name, _) in enumerate(rows):
+            if kind != "state" and name in names:
+                wanted[i, names.index(name)] = 1.0
+        moved, own = [], []
+        for system in self.systems:
+            b, d = system.driven("faults")
+            own.append(d.absolute() + (first.cz @ b + exact(wanted)).absolute())
+            moved += [other.az @ b for other in self.systems]
+        bounds = contraction.bounds(moved, own)
+        estimates = [bounds[i, names.index(name)] for i, (kind, name, _) in enumerate(rows) if kind == "fault"]
+        if max(estimates) > ESTIMATE_SHARE:
+            return None
+        return {"claim": "faults over the region", "bounds": matrix_data(bounds)}
+
+    def _add_gain(self) -> None:
+        claims, plant = self.design.certificate.claims, self.design.scheduled[0]
+        name, letter, signal, kind = GAINS.get(self.design.method, ("", "", "", ""))
+        if name not in claims or not plant.nf or (signal == "disturbances" and not plant.nd):
+            return
+        matrices, found = self._lyapunov_matrices(letter), None
+        rows = [i for i, (own, _, _) in enumerate(rows_of(self.systems[0].observer)) if own == kind]
+        for room in NORM_ROOM if matrices is not None else ():
+            gamma = claims[name] * room
+
+            def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic, gamma: float = gamma) -> Dyadic:
+                b, d = system.driven(signal)
+                return system.bounded_real_form(
+                    gamma, p, after, system.az, b, -system.cz.rows_at(rows), d.rows_at(rows)
+                )
+
+            witnesses, stated = self._at_all_pairs(matrices or [], form), self._of_matrices(matrices or [])
+            if witnesses is not None and stated is not None:
+                found = {
+                    "claim": "gain over the region", "signal": signal, "rows": [kind],
+                    "gamma": number_data(gamma), **stated, "bounded_real": witnesses,
+                }  # fmt: skip
+                break
+        slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
+        self._add(f"the l2 gain {claims[name]:.6g} from the {signal}{slow}", found)
+
+    def _add_mean_square(self) -> None:
+        claims, matrices = self.design.certificate.claims, self._lyapunov_matrices(GAIN_WITNESSES[0])
+        if "region_deviation" not in claims:
+            return
+        rows = [i for i, (kind, _, _) in enumerate(rows_of(self.systems[0].observer)) if kind == "state"]
+        c = self.systems[0].cz.rows_at(rows)
+
+        def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic) -> Dyadic:
+            return p - system.az.T @ after @ system.az - c.T @ c
+
+        witnesses = None if matrices is None or not self.discrete else self._at_all_pairs(matrices, form)
+        stated, found = self._of_matrices(matrices or []), None
+        if matrices and witnesses is not None and stated is not None:
+            largest = Fraction(0)
+            for system in self.systems:
+                b, d = system.driven("noise")
+                direct = d.rows_at(rows)
+                parts = [_trace(b.T @ after @ b) + _trace(direct.T @ direct) for after in matrices]
+                largest = max([largest, *parts])
+            level = max(root_above(largest), claims["region_deviation"])
+            if level <= claims["region_deviation"] * NORM_ROOM[-1]:
+                found = {
+                    "claim": "mean square over the region", "rows": ["state"], "level": number_data(level),
+                    **stated, "decreases": witnesses,
+                }  # fmt: skip
+        slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
+        self._add(f"the mean square of the errors{slow}", found)
+
+
+@dataclass(frozen=True, eq=False)
+class _RegionContraction:
+    """What columns of inputs at the vertices do to each row at most, as the checker bounds it."""
+
+    cz: Dyadic
+    matrices: Sequence[Dyadic]
+    g: Dyadic
+    slowness: Fraction
+
+    def bounds(self, columns: Sequence[Dyadic], own: Sequence[Dyadic]) -> FloatArray:
+        """Return what the checker accepts: the largest own part, and what any of the columns adds to it."""
+        (rows, count), seen = own[0].shape, self.cz @ self.g @ self.cz.T
+        lengths = [Fraction(0)] * count
+        for each in columns:
+            for P in self.matrices:
+                products = each.T @ P @ each
+                lengths = [max(length, products.fraction(j, j)) for j, length in enumerate(lengths)]
+        bounds = np.zeros((rows, count))
+        for i in range(rows):
+            for j in range(count):
+                added = Fraction(root_above(seen.fraction(i, i) * lengths[j] / self.slowness**2))
+                largest = max(part.fraction(i, j) for part in own)
+                bounds[i, j] = rounded_outward((largest + added) * Fraction(BOUND_ROOM))
+        return bounds
+
+
+def _above_inverses(matrices: Sequence[Dyadic]) -> tuple[Dyadic, list[dict[str, Any]]] | None:
+    """Return G with ``[P, I; I, G] > 0`` for each P: a multiple of the inverse of their mean."""
+    mean = matrices[0]
+    for P in matrices[1:]:
+        mean = mean + P
+    inverted = inverse_above(mean.scaled(1.0 / len(matrices)))
+    identity = Dyadic.identity(mean.shape[0])
+    for factor in COVERING_FACTORS if inverted is not None else ():
+        G = inverted[0].scaled(factor)  # type: ignore[index]
+        covers = [witness for P in matrices if (witness := definite_witness(blocks([[P, identity], [identity, G]])))]
+        if len(covers) == len(matrices):
+            return G, covers
+    return None
+
+
+def _trace(matrix: Dyadic) -> Fraction:
+    return sum((matrix.fraction(i, i) for i in range(matrix.shape[0])), Fraction(0))
