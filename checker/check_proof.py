@@ -942,7 +942,8 @@ def rounding_adds_little_over_region(region, claim):
         worst = max([worst, *entries_of(bounds)])
         if kind == "states":
             require_faults_are_seen(region.first, bounds)
-    return f"rounding adds at most {shown(worst)} to any row, per unit of any {', '.join(pairs)}{region.words}"
+    listed = "state, input or disturbance" if region.first.decoupled else "state or input"
+    return f"rounding adds at most {shown(worst)} to any row, per unit of any {listed}{region.words}"
 
 
 def faults_are_estimated_over_region(region, claim):

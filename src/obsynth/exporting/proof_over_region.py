@@ -60,7 +60,7 @@ GAINS = {
 def refusal_over_region(design: ObserverDesign) -> str:
     """Return why a design over a region has no proof file; empty where it has one."""
     if not isinstance(design.plant, PolytopicSystem) or not isinstance(design.observer, ScheduledObserver):
-        return "it is for a nonlinear plant"
+        return "its observer is not scheduled"
     if design.observer.correction is not None:
         return "its faults turn their directions, and it corrects its state by its residuals"
     if not design.plant.is_constant("E", "C", "D", "Df", "Dd", "Dw"):
@@ -179,7 +179,8 @@ class RegionProof:
             self._add_gain()
         else:
             self.not_covered.append(
-                "the gain and the faults' own estimates: fault rows are divided by an effectiveness that changes"
+                "the gain and the faults' own estimates: fault rows in the file are those before they are divided by "
+                "an effectiveness that changes"
             )
         self.not_covered += ALWAYS_LEFT
         if not self.discrete:
