@@ -58,7 +58,7 @@ def mutants(heading: str | None = None) -> list[Mutant]:
     """Return the rows of the first table, or of the one below a heading."""
     text = TABLE.read_text(encoding="utf-8")
     part = text.split("\n## ")[0] if heading is None else text.split(f"\n## {heading}\n")[1]
-    rows = re.findall(r"^\| ([\w/]+\.py) \| `(.+?)` \| `(.+?)` \| (.*) \|$", part, re.MULTILINE)
+    rows = re.findall(r"^\| ([\w/]+\.(?:py|c)) \| `(.+?)` \| `(.+?)` \| (.*) \|$", part, re.MULTILINE)
     return [Mutant(file, was.replace("\\|", "|"), became.replace("\\|", "|"), test) for file, was, became, test in rows]
 
 
@@ -68,7 +68,8 @@ def verdict(mutant: Mutant, tests: list[str], work: Path) -> str:
     original = file.read_text(encoding="utf-8")
     try:
         changed = mutant.source(original)
-        ast.parse(changed)
+        if file.suffix == ".py":
+            ast.parse(changed)
     except (ValueError, SyntaxError) as error:
         return f"does not apply: {error}"
     file.write_text(changed, encoding="utf-8")

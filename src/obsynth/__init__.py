@@ -140,10 +140,10 @@ def _summary_of_design(design: Any) -> Any:
     return summary(design)
 
 
-def _monitor_in_c(monitor: Any, design: Any) -> Any:
+def _monitor_in_c(monitor: Any, design: Any, seconds: float | None = None) -> Any:
     from obsynth.monitoring.exporting import monitor_in_c
 
-    return monitor_in_c(monitor, design)
+    return monitor_in_c(monitor, design, seconds)
 
 
 def _bound_of_monitor(monitor: Any, observer: Any) -> Any:

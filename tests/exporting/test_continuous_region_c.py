@@ -29,6 +29,7 @@ int main(void)
         region_step(&s, in, in + NU, ARGUMENTS);
         printf("%d %d", s.status, s.any_alarm);
         for (i = 0; i < NX + NF + NR; i++) printf(" %.17g", rows[i]);
+        MORE
         printf("\\n");
     }
 }
@@ -72,7 +73,8 @@ def rows_of(design: ObserverDesign, seed: int, count: int) -> FloatArray:
     held, nu = plant.scheduling, plant.nu
     p = len(held.names)
     if held.gives_weights:
-        parameters = rng.dirichlet(np.ones(p), count)
+        parameters = 1.1 + np.sin(0.05 * np.arange(count)[:, None] + 2.0 * np.arange(p))
+        parameters /= parameters.sum(axis=1, keepdims=True)
     else:
         share = 0.5 + 0.5 * np.sin(0.05 * np.arange(count)[:, None] + np.arange(p))
         parameters = held.low + (held.high - held.low) * share
@@ -83,15 +85,15 @@ def rows_of(design: ObserverDesign, seed: int, count: int) -> FloatArray:
     return rows
 
 
-def in_c(design: ObserverDesign, folder: Path, rows: FloatArray, **options: Any) -> FloatArray:
-    """Return what C says of rows: status, alarm, estimates."""
+def in_c(design: ObserverDesign, folder: Path, rows: FloatArray, more: str = "", **options: Any) -> FloatArray:
+    """Return what C says of rows: status, alarm, estimates, and ``more`` that is printed."""
     observer = design.scheduled[1]
     obsynth.export(design, folder / "region.c", **options)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     sizes = {"NU": len(observer.input_names), "NY": len(observer.output_names), "NX": nx, "NF": nf, "NR": nr}
     groups = ", ".join(f"rows + {at}" for at, size in ((0, nx), (nx, nf), (nx + nf, nr)) if size)
     defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
-    (folder / "main.c").write_text(defined + _MAIN.replace("ARGUMENTS", groups))
+    (folder / "main.c").write_text(defined + _MAIN.replace("ARGUMENTS", groups).replace("MORE", more))
     made = subprocess.run(
         ["gcc", *_FLAGS, "main.c", "region.c", "-lm", "-o", "region"], cwd=folder, capture_output=True, text=True
     )
@@ -110,6 +112,61 @@ def on_a_log(design: ObserverDesign, folder: Path, rows: FloatArray, h: float, *
         obsynth.run_on_data(design, log.iloc[part], out=folder / "run.csv", state=folder / "state.json", **options)
         parts.append(pd.read_csv(folder / "run.csv"))
     return pd.concat(parts, ignore_index=True)
+
+
+def watched_plant(seed: int) -> PolytopicSystem:
+    """Return a plant with noise of its sensors and a bounded disturbance, linear in its parameters, or with weights."""
+    rng, plant = np.random.default_rng([seed, 52]), random_plant(3 * seed)
+    noisy = [
+        vertex.replace(Bw=np.zeros((plant.nx, plant.ny)), Dw=0.002 * np.eye(plant.ny), noise_names=None)
+        for vertex in plant.vertices
+    ]
+    if seed % 2:
+        return PolytopicSystem(noisy)
+    first, turn = noisy[0], 0.2 * rng.standard_normal((2, plant.nx, plant.nx))
+    turn[:, np.flatnonzero(~plant.E.any(axis=1))] = 0.0
+    A = [
+        [f"{first.A[i, j]:.6f} + {turn[0, i, j]:.6f} * q + {turn[1, i, j]:.6f} * p" for j in range(plant.nx)]
+        for i in range(plant.nx)
+    ]
+    names = ("E", "Bf", "Bd", "C", "Bw", "Dw") + (() if seed % 10 == 0 else ("B",))
+    fixed = {name: getattr(first, name).tolist() for name in names}
+    return PolytopicSystem(plant={**fixed, "A": A}, scheduling={"p": [-1, 1.2], "q": {"range": [0, 2], "rate": 1e3}})
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
+@pytest.mark.usefixtures("taken_as_verified")
+@pytest.mark.parametrize(
+    ("seed", "h", "initial_error", "warm_up"),
+    [
+        (2, 0.1, None, None),
+        (3, 0.1, 0.5, 0.0),
+        (20, 0.05, 0.0, None),
+        *(pytest.param(s, 0.1, None, 0.0, marks=pytest.mark.long) for s in (8, 14, 22, 25, 26, 27)),
+    ],
+)
+def test_guaranteed_thresholds_in_c_follow_the_rows_as_in_a_run(
+    seed: int, h: float, initial_error: float | None, warm_up: float | None, tmp_path: Path
+) -> None:
+    """Norm and threshold of every row, through gaps and rows outside, and after rows outside from the start again."""
+    design = obsynth.ui_pi_observer(watched_plant(seed))
+    bounds = dict.fromkeys(design.plant.disturbance_names, 0.1)
+    monitor = obsynth.online_monitor(design, disturbance_bounds=bounds, noise_bound=3, initial_error=initial_error)
+    rows, ny = rows_of(design, seed, 1500), design.plant.ny
+    if initial_error is not None:
+        # The first rows are whole: the stated start counts.
+        rows[:4] = rows[4]
+    rows[:, -ny:] *= np.where(np.arange(1500) % 90 < 45, 0.01, 1.0)[:, None]
+    more = ' printf(" %.17g %.17g %d", s.monitor.norm, s.monitor.threshold, s.monitor.alarm);'
+    found = in_c(design, tmp_path, rows, more, sample_time=h, monitor=monitor, warm_up=warm_up)
+    run = on_a_log(design, tmp_path, rows, h, monitor=monitor, warm_up=warm_up)
+    assert [_STATUSES[int(status)] for status in found[:, 0]] == run.status.tolist()
+    numbers, in_texts = run[["statistic", "threshold"]].to_numpy(), found[:, -3:-1]
+    assert np.array_equal(np.isnan(numbers), np.isnan(in_texts))
+    shown = ~np.isnan(numbers)
+    assert shown[:, 1].sum() > 200
+    assert np.max(np.abs(numbers - in_texts)[shown] / np.maximum(np.abs(numbers[shown]), 1e-3)) < 1e-11
+    assert np.array_equal(found[:, -1] == 1.0, run.alarm.notna())
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
@@ -142,13 +199,10 @@ def test_c_equals_a_run_that_is_resumed(seed: int, h: float, tmp_path: Path) -> 
 
 @pytest.mark.usefixtures("taken_as_verified")
 def test_what_is_not_written_is_refused_with_what_can_be_done(tmp_path: Path) -> None:
-    plant = PolytopicSystem(
-        plant={
-            "A": [["-1 - v", 1], [0, -2]], "Bf": [[0], [1]], "C": [[1, 0], [0, 1]],
-            "Bw": [[0], [0]], "Dw": [[0], [0.01]],
-        },
-        scheduling={"v": [0, 1]},
-    )  # fmt: skip
+    matrices: dict[str, Any] = {
+        "A": [["-1 - v", 1], [0, -2]], "Bf": [[0], [1]], "C": [[1, 0], [0, 1]], "Bw": [[0], [0]], "Dw": [[0], [0.01]],
+    }  # fmt: skip
+    plant = PolytopicSystem(plant=matrices, scheduling={"v": [0, 1]})
     design = obsynth.ui_pi_observer(plant)
     for name in ("region.c", "region.fmu"):
         with pytest.raises(SpecError, match="continuous in time: give the sample time"):
@@ -158,8 +212,13 @@ def test_what_is_not_written_is_refused_with_what_can_be_done(tmp_path: Path) ->
     with pytest.raises(SpecError, match="leave precision out"):
         obsynth.export(design, tmp_path / "region.c", sample_time=0.1, precision="float")
     monitor = obsynth.online_monitor(design, noise_bound=3.0)
-    with pytest.raises(SpecError, match="enclosures of the functions of the parameters"):
-        obsynth.export(design, tmp_path / "region.c", sample_time=0.1, monitor=monitor)
+    with pytest.raises(SpecError, match=r"no row would have a threshold\. Give a shorter sample time"):
+        obsynth.export(design, tmp_path / "region.c", sample_time=50.0, monitor=monitor)
+    squared = {**matrices, "A": [["-1 - v ** 2", 1], [0, -2]]}
+    other = obsynth.ui_pi_observer(PolytopicSystem(plant=squared, scheduling={"v": [0, 1]}))
+    enclosed = obsynth.online_monitor(other, noise_bound=3.0)
+    with pytest.raises(SpecError, match=r"by enclosures of 'v \*\* 2' between two of them"):
+        obsynth.export(other, tmp_path / "region.c", sample_time=0.1, monitor=enclosed)
     assert not list(tmp_path.iterdir())
     # What the message names.
     assert obsynth.export(design, tmp_path / "region.c", sample_time=0.1, thresholds={"fhat[f1]": 0.2})

@@ -120,4 +120,5 @@ def test_every_mutant_applies_to_the_sources_and_compiles():
         source = (home / mutant.file).read_text("utf-8")
         changed = mutant.source(source)
         assert changed != source, mutant.was
-        ast.parse(changed)
+        if mutant.file.endswith(".py"):
+            ast.parse(changed)

@@ -42,8 +42,22 @@ class MonitorVariable(NamedTuple):
     expression: str
 
 
+def isolated_fault(fault_names: Sequence[str]) -> MonitorVariable:
+    """Return the fault that an alarm points to, by its number."""
+    listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(fault_names))
+    return MonitorVariable(
+        "isolated", f"number of the fault of the plant that an alarm points to, 0 for none ({listed})", "fault + 1.0"
+    )
+
+
 class ExportedMonitor(Protocol):
-    """A monitor whose C stands beside that of its observer: ``monitor_reset`` and ``monitor_take``."""
+    """A monitor whose C stands beside that of its observer: ``monitor_reset`` and ``monitor_take``.
+
+    One that ``follows_rows`` has ``monitor_follow`` besides, which takes states, inputs and parameters before it."""
+
+    @property
+    def follows_rows(self) -> bool:
+        """Whether its threshold hangs on the signals of the rows."""
 
     @property
     def statement(self) -> str:

@@ -168,6 +168,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         "CORRECTS": int(observer.correction is not None),
         "IS_CONTINUOUS": int(is_continuous),
         "MONITORS": int(alarms.monitor is not None),
+        "MONITOR_FOLLOWS": int(alarms.monitor is not None and alarms.monitor.follows_rows),
         "WATCHED": len(alarms.levels),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }

@@ -268,7 +268,7 @@ def _write_scheduled(
     if numbers != "double":
         raise SpecError("A design over a region is written in doubles: leave precision out.", path="precision")
     seconds = seconds_between_rows(design.scheduled[1], sample_time)
-    written = None if monitor is None else registered("monitor_in_c")(monitor, design)
+    written = None if monitor is None else registered("monitor_in_c")(monitor, design, seconds)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 

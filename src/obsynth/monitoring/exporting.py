@@ -1,26 +1,23 @@
-"""Monitors in exported files: learned thresholds and bounds over a region as C beside their observer, and bounds over
-tolerances."""
+"""Monitors in exported files: learned thresholds as C beside their observer, and bounds over tolerances."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import STATISTIC, MonitorVariable
+from obsynth.exporting.alarms import STATISTIC, ExportedMonitor, MonitorVariable, isolated_fault
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
+from obsynth.monitoring.region_monitors import region_monitor_in_c
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
-from obsynth.monitoring.thresholds.euler_rule import EulerRule
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, OWN_MOST, LearnedRule, follow_shares
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
-from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.monitoring.thresholds.watched_columns import as_learned, watched_names
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
@@ -45,6 +42,8 @@ class LearnedMonitorInC:
     walk: FloatArray | None
     outputs: int
 
+    follows_rows: ClassVar[bool] = False
+
     @property
     def statement(self) -> str:
         """What its thresholds mean."""
@@ -56,7 +55,7 @@ class LearnedMonitorInC:
         held = f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"
         return (
             MonitorVariable(STATISTIC, f"largest statistic in units of its level: {self.statement}", "statistic"),
-            _isolated(self.fault_names),
+            isolated_fault(self.fault_names),
             MonitorVariable("event", held, "event"),
         )
 
@@ -202,76 +201,11 @@ class LearnedMonitorInC:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class RegionMonitorInC:
-    """A bound on the residual for every course of the parameters as C: an `obsynth.exporting.alarms.ExportedMonitor`.
-
-    ``table``: bounds by the row since the start; ``limit``: for ever after; ``fault_scales (nf,)``: what fault
-    estimates are compared in.
-    """
-
-    statement: str
-    table: FloatArray
-    limit: float
-    residuals: int
-    fault_names: tuple[str, ...]
-    fault_scales: FloatArray
-
-    @property
-    def variables(self) -> tuple[MonitorVariable, ...]:
-        """The norm of the residual in units of its threshold, and the fault that an alarm points to."""
-        return (
-            MonitorVariable(STATISTIC, f"norm of the residual by its threshold: {self.statement}", "statistic"),
-            _isolated(self.fault_names),
-        )
-
-    def watched_observer(self, observer: Any) -> Any:
-        """Return the observer as it is."""
-        return observer
-
-    def struct_lines(self, prefix: str) -> list[str]:
-        """Return the declaration of the monitor's structure."""
-        return [
-            "typedef struct {",
-            "    /* Read these after a step: the norm of the residual in units of its threshold, both of them,",
-            "     * NaN where nothing is decided; whether the threshold is passed, and by which fault (-1: none). */",
-            "    REAL statistic, norm, threshold;",
-            "    int alarm, fault;",
-            "    /* Everything else is the monitor's own. */",
-            "    int is_decided;",
-            "    long row;",
-            f"}} {prefix}_monitor;",
-            "",
-        ]
-
-    def source(self, prefix: str) -> str:
-        """Return the tables and functions of the monitor."""
-        sizes = {
-            "TABLE_LENGTH": len(self.table),
-            "MONITOR_RESIDUALS": self.residuals,
-            "MONITOR_FAULTS": len(self.fault_names),
-        }
-        lines = [
-            f"enum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
-            f"#define MONITOR_LIMIT ((REAL){self.limit!r})",
-            *table_lines("monitor_table", filled_table(self.table[None])),
-            *table_lines("monitor_scales", filled_table(self.fault_scales[None])),
-        ]
-        return "\n".join(lines) + filled_template("region_threshold.c", prefix, {}, "obsynth.monitoring")
-
-
-def _isolated(fault_names: Sequence[str]) -> MonitorVariable:
-    """Return the fault that an alarm points to, by its number."""
-    listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(fault_names))
-    return MonitorVariable(
-        "isolated", f"number of the fault of the plant that an alarm points to, 0 for none ({listed})", "fault + 1.0"
-    )
-
-
-def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC | RegionMonitorInC | None:
-    """Return a monitor of this design as C; ``None`` where it is of a kind that is written otherwise, or not."""
+def monitor_in_c(monitor: Monitor, design: ObserverDesign, seconds: float | None = None) -> ExportedMonitor | None:
+    """Return a monitor of this design as C, with so many ``seconds`` between rows where it needs them; ``None`` where
+    it is of a kind that is written otherwise, or not."""
     if isinstance(design.observer, ScheduledObserver):
-        return _region_monitor(monitor, design.observer)
+        return region_monitor_in_c(monitor, design.observer, seconds)
     if not isinstance(monitor.rule, LearnedRule):
         return None
     learned = monitor.rule.learned
@@ -289,28 +223,6 @@ def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC 
         tuple(design.observer.fault_names),
         parameter_walk(design.observer),
         len(design.plant.output_names),
-    )
-
-
-def _region_monitor(monitor: Monitor, observer: ScheduledObserver) -> RegionMonitorInC:
-    monitor.require_fit(len(observer.residual_names), observer.fault_names)
-    if isinstance(monitor.rule, EulerRule):
-        raise SpecError(
-            "The guaranteed threshold of a design over a region in continuous time follows the rows, by enclosures of "
-            "the functions of the parameters between two of them, which are not written as C: run it with "
-            "obsynth.run_on_data, or give levels of the outputs (thresholds={...}, --threshold) for C.",
-            path="monitor",
-        )
-    bound = monitor.rule.bound_by_row if isinstance(monitor.rule, NormRule) else None
-    if monitor.kind != "pointwise" or bound is None:
-        raise SpecError(
-            "C of a design over a region holds guaranteed thresholds (kind 'pointwise' of obsynth.online_monitor) and "
-            "levels of its outputs, not this monitor: run it on rows with obsynth.run_on_data.",
-            path="monitor",
-        )
-    table, limit = bound
-    return RegionMonitorInC(
-        monitor.statement, table, float(limit), monitor.residuals, monitor.fault_names, monitor.fault_scales
     )
 
 

@@ -37,6 +37,9 @@ static void watch(PREFIX_state *s, const REAL *shown)
 {
     int i;
     s->any_alarm = 0;
+#if MONITOR_FOLLOWS
+    monitor_follow(&s->monitor, s->status == UPPER_OK, shown - STATE_COUNT, s->u, s->parameters, s->weights);
+#endif
 #if MONITORS
     monitor_take(&s->monitor, s->status == UPPER_OK, shown, shown + FAULT_COUNT);
 #endif

@@ -83,78 +83,86 @@ class EulerErrorBound:
         """Return the bound after a row, and the share of an error before it that is left; infinite where none is
         known."""
         h, turned, units = row.seconds, row.turned, self.motion.units
-        if not self._growth * h < MOST_GROWTH:
+        if not self.growth * h < MOST_GROWTH:
             return np.inf, np.inf
         A, B = (np.tensordot(row.weights, part, 1) for part in (self.motion.A, self.motion.B))
         slope = A @ row.states + B @ row.inputs
-        turns = self._A_turns @ row.states + self._B_turns @ row.inputs
+        turns = self.A_turns @ row.states + self.B_turns @ row.inputs
         # By how much slopes since the row before may differ from the one that is estimated at the row.
-        spread = turned @ _norms(turns / units) + row.moved @ self._slope_of_inputs + self._slope_of_noise
-        second, third = 0.5 * h * h, _third_order(self._growth, h)
-        missed = h * (turned @ (_norms(turns @ self._drive.T) + self._turned_noise) + row.moved @ self._drive_of_inputs)
-        missed += second * (_norms(self._drive @ A @ slope) + turned @ _norms(self._A_turns @ slope @ self._drive.T))
-        missed += self._drift * ((second + third) * spread + third * _norms(slope / units))
-        own = h * (turned @ self._turned_error) + self._drift * (second + third) * self._slope_of_error
+        spread = turned @ _norms(turns / units) + row.moved @ self.slope_of_inputs + self.slope_of_noise
+        second, third = 0.5 * h * h, third_order(self.growth, h)
+        missed = h * (turned @ (_norms(turns @ self.drive.T) + self.turned_noise) + row.moved @ self.drive_of_inputs)
+        missed += second * (_norms(self.drive @ A @ slope) + turned @ _norms(self.A_turns @ slope @ self.drive.T))
+        missed += self.drift * ((second + third) * spread + third * _norms(slope / units))
+        own = h * (turned @ self.turned_error) + self.drift * (second + third) * self.slope_of_error
         left = 1.0 + self.decay * h - float(own) * OUTWARD
         if not left > 0.0:
             return np.inf, np.inf
         return (size + (float(missed) + h * self.driven) * OUTWARD) / left * OUTWARD, OUTWARD / left
 
     @cached_property
-    def _drive(self) -> FloatArray:
+    def drive(self) -> FloatArray:
         """From slopes of the plant to the norm of e."""
         return np.asarray(self.root @ self.tracking)
 
     @cached_property
-    def _error(self) -> FloatArray:
+    def error(self) -> FloatArray:
         """From e in its norm to the state of the plant."""
         return np.asarray(self.motion.by_error @ np.linalg.inv(self.root))
 
     @cached_property
-    def _A_turns(self) -> FloatArray:
+    def A_turns(self) -> FloatArray:
+        """``(N, n, n)``: A at each vertex less their mean."""
         return np.asarray(self.motion.A - self.motion.A.mean(axis=0))
 
     @cached_property
-    def _B_turns(self) -> FloatArray:
+    def B_turns(self) -> FloatArray:
+        """``(N, n, nu)``: the same of B."""
         return np.asarray(self.motion.B - self.motion.B.mean(axis=0))
 
     @cached_property
-    def _growth(self) -> float:
+    def growth(self) -> float:
         """By how much states may grow in a second, in their units."""
         return _largest(self.motion.A * self.motion.units / self.motion.units[:, None])
 
     @cached_property
-    def _drift(self) -> float:
+    def drift(self) -> float:
         """How much a change of the states, in their units, drives e."""
-        return _largest(self._drive @ self.motion.A * self.motion.units)
+        return _largest(self.drive @ self.motion.A * self.motion.units)
 
     @cached_property
-    def _slope_of_error(self) -> float:
-        return _largest(self.motion.A @ self._error / self.motion.units[:, None])
+    def slope_of_error(self) -> float:
+        """How much an error changes the slopes of the states, in their units."""
+        return _largest(self.motion.A @ self.error / self.motion.units[:, None])
 
     @cached_property
-    def _slope_of_noise(self) -> float:
+    def slope_of_noise(self) -> float:
+        """How much disturbances and noise change these."""
         parts = np.concatenate([self.motion.A @ self.motion.by_noise, self.motion.Bd], axis=2)
         return float(np.max(sums_of_column_norms(parts / self.motion.units[:, None]), initial=0.0))
 
     @cached_property
-    def _slope_of_inputs(self) -> FloatArray:
+    def slope_of_inputs(self) -> FloatArray:
+        """``(nu,)``: how much each input changes these."""
         return np.asarray(np.max(np.linalg.norm(self.motion.B / self.motion.units[:, None], axis=1), axis=0))
 
     @cached_property
-    def _drive_of_inputs(self) -> FloatArray:
-        return np.asarray(np.max(np.linalg.norm(self._drive @ self.motion.B, axis=1), axis=0))
+    def drive_of_inputs(self) -> FloatArray:
+        """``(nu,)``: how much each input drives e."""
+        return np.asarray(np.max(np.linalg.norm(self.drive @ self.motion.B, axis=1), axis=0))
 
     @cached_property
-    def _turned_error(self) -> FloatArray:
-        return np.asarray(np.linalg.norm(self._drive @ self._A_turns @ self._error, 2, axis=(1, 2)))
+    def turned_error(self) -> FloatArray:
+        """``(N,)``: how much a turned weight drives e by the error of the state."""
+        return np.asarray(np.linalg.norm(self.drive @ self.A_turns @ self.error, 2, axis=(1, 2)))
 
     @cached_property
-    def _turned_noise(self) -> FloatArray:
-        return sums_of_column_norms(self._drive @ self._A_turns @ self.motion.by_noise)
+    def turned_noise(self) -> FloatArray:
+        """``(N,)``: how much it drives e by disturbances and noise."""
+        return sums_of_column_norms(self.drive @ self.A_turns @ self.motion.by_noise)
 
 
-def _third_order(growth: float, seconds: float) -> float:
+def third_order(growth: float, seconds: float) -> float:
     """Return ``(e^x - 1 - x - x^2 / 2) / growth^2`` for ``x = growth seconds``, or a little more."""
     x = growth * seconds
     if x < SERIES_BELOW:

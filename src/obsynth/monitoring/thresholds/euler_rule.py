@@ -46,17 +46,17 @@ class EulerRule(Rule):
     adapts = True
 
     def __init__(self, observer: ScheduledObserver, bounds: list[ResidualBound], direct: float) -> None:
-        self._observer, self._bounds, self._direct = observer, bounds, direct
+        self._observer, self.bounds, self.direct = observer, bounds, direct
 
     def init(self) -> EulerState:
         """Return the state before the first sample."""
-        starts = [bound.start for bound in self._bounds]
+        starts = [bound.start for bound in self.bounds]
         sizes = np.array([0.0 if start is None else start for start in starts])
         return EulerState(sizes, np.array([1.0 if start is None else 0.0 for start in starts]))
 
     def restart(self, state: EulerState, skipped: int = 0) -> EulerState:
         """Begin again with an error of which nothing is known."""
-        return EulerState(np.zeros(len(self._bounds)), np.ones(len(self._bounds)))
+        return EulerState(np.zeros(len(self.bounds)), np.ones(len(self.bounds)))
 
     def step(self, state: EulerState, sample: Sample) -> tuple[EulerState, RuleOutput]:
         """Return the state after a sample, the norm of the residual and its threshold; infinite before it settles."""
@@ -67,11 +67,11 @@ class EulerRule(Rule):
         sizes, shares = state.sizes, state.shares
         if state.last is not None and state.inputs is not None and sample.time > state.last:
             row = self._change(observation, state.inputs, signals, sample.time - state.last)
-            made = [bound.errors.after(float(size), row) for bound, size in zip(self._bounds, sizes, strict=True)]
+            made = [bound.errors.after(float(size), row) for bound, size in zip(self.bounds, sizes, strict=True)]
             sizes, shares = np.array([size for size, _ in made]), shares * np.array([left for _, left in made])
         settled = shares <= FORGOTTEN_SHARE
-        limits = [bound.gain * size for bound, size, known in zip(self._bounds, sizes, settled, strict=True) if known]
-        threshold = (min(limits, default=math.inf) + self._direct) * OUTWARD
+        limits = [bound.gain * size for bound, size, known in zip(self.bounds, sizes, settled, strict=True) if known]
+        threshold = (min(limits, default=math.inf) + self.direct) * OUTWARD
         # A bound that was lost begins again.
         lost = ~np.isfinite(sizes)
         sizes, shares = np.where(lost, 0.0, sizes), np.where(lost, 1.0, shares)
@@ -82,13 +82,13 @@ class EulerRule(Rule):
 
     def options(self) -> list[float]:
         """Return what the bounds are made of."""
-        return [self._direct, *(number for b in self._bounds for number in (b.gain, b.errors.decay, b.errors.driven))]
+        return [self.direct, *(number for b in self.bounds for number in (b.gain, b.errors.decay, b.errors.driven))]
 
     def _change(self, observation: Any, before: FloatArray, signals: FloatArray, seconds: float) -> RowChange:
         observer, nu = self._observer, self._observer.inputs
         scheduling = observer.scheduling
         weights, turned = weights_between(scheduling, before[nu:], signals[nu:])
-        motion = self._bounds[0].errors.motion
+        motion = self.bounds[0].errors.motion
         states = motion.estimated @ observation.rows[observer.state_rows]
         return RowChange(seconds, states, signals[:nu], np.abs(signals[:nu] - before[:nu]), weights, turned)
 
