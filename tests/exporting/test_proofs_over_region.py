@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -92,6 +93,15 @@ def test_what_a_file_claims_is_proved_by_a_process_of_its_own(name: str, tmp_pat
 def test_what_is_proved_for_slow_parameters_alone_is_not_covered() -> None:
     (left,) = (text for text in file_of("slow pi")["not_covered"] if "l2 gain" in text)
     assert "change slowly" in left
+
+
+def test_a_proof_that_fails_for_every_course_is_not_called_one_for_slow_parameters() -> None:
+    """Matrices of a certificate that prove nothing, of a plant whose parameter has no rate."""
+    design = design_of("pi")
+    matrices = {**design.certificate.matrices, "P_region": -design.certificate.matrices["P_region"]}
+    left = proof_of(design.replace(certificate=replace(design.certificate, matrices=matrices)))["not_covered"]
+    assert "decay over the region" in left
+    assert not any("slowly" in text for text in left)
 
 
 def test_a_file_of_a_region_is_written_and_checked_on_the_command_line(

@@ -255,7 +255,7 @@ class RegionProof:
     @property
     def _is_slow(self) -> bool:
         """Whether the parameters have rates: what is proved with these need not hold for jumps."""
-        return bool(self.design.scheduled[0].scheduling.rates)
+        return any(rate is not None for rate in self.design.scheduled[0].scheduling.rates)
 
     def _contraction(self, matrices: Sequence[Dyadic], slowness: float) -> _RegionContraction | None:
         """Return a contraction with the Lyapunov matrices of the decay, and write its data."""
