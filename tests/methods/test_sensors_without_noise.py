@@ -233,3 +233,83 @@ def test_a_least_mean_square_that_is_rounding_is_zero() -> None:
     claims = obsynth.optimal_filter(plant, norm="h2", reference={"bandwidth": 1.0, "order": 2}).certificate.claims
     assert claims["least_deviation"] == 0.0
     assert claims["deviation"] < 1e-6
+
+
+#: Plants of index 1 of which some signals reach the outputs at once by rounding of the products that say so, or all
+#: outputs together show nothing of the algebraic state.
+MIXED_EQUATIONS = {
+    "fault": {
+        "E": [[1.3, -0.1, 0.4, 0.0], [0.1, 1.4, -0.3, 0.0], [0.2, 0.0, 1.1, 0.0], [-0.4, 0.0, 0.1, 0.0]],
+        "A": [
+            [-0.76, 0.6, -2.68, -2.63], [-2.85, -3.65, 2.03, -0.28],
+            [1.86, 0.68, -3.48, -0.27], [2.77, -0.05, -0.78, 0.0],
+        ],
+        "Bf": [[0.44], [-1.63], [1.3], [0.16]],
+        "Bw": [[0.11, 0.22], [-0.19, -0.53], [1.0, -0.82], [1.7, 0.15]],
+        "C": [[0.3, 2.2, -0.9, 1.4], [0.2, -0.7, 0.2, -1.3], [-0.2, 0.2, 0.4, 0.2]],
+    },
+    "noise": {
+        "E": [[0.9, 0.2, 0.1, 0.0], [0.4, 0.6, 0.2, 0.0], [-0.5, 0.1, 1.2, 0.0], [0.2, 0.0, -0.5, 0.0]],
+        "A": [
+            [-2.28, -1.23, 0.05, 0.28], [-1.94, -1.7, 0.22, -0.26],
+            [0.29, 2.64, -3.68, -2.47], [1.73, -0.34, 0.32, -0.49],
+        ],
+        "Bf": [[-0.96], [-0.38], [-0.45], [0.29]],
+        "Bw": [[-0.12, 0.46], [0.3, 0.3], [0.57, 1.77], [-0.21, -0.12]],
+        "C": [[-0.7, 2.1, 0.1, 0.6], [0.6, -1.3, 0.9, 0.8], [-3.1, -0.2, -0.8, 0.0]],
+    },
+    "algebraic state": {
+        "E": [[0.5, -0.3, 0.3, 0.0], [-0.3, 0.5, -0.1, 0.0], [-0.4, 0.1, 0.9, 0.0], [0.1, 0.4, 1.0, 0.0]],
+        "A": [
+            [-1.64, 2.05, -2.1, -0.34], [2.04, -1.3, 1.2, 0.22],
+            [2.22, -0.87, -2.64, 0.11], [2.14, 0.76, -3.54, -0.13],
+        ],
+        "Bf": [[0.45], [-0.11], [1.88], [1.93]],
+        "Bw": [[1.14, -1.05], [-1.09, 1.45], [-0.93, 1.42], [-0.49, 1.61]],
+        "C": [[0.3, -0.6, 0.0, -0.6], [0.1, -0.9, -0.2, -0.5], [2.4, 3.1, 0.0, -0.1]],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MIXED_EQUATIONS)
+def test_signals_that_reach_the_outputs_at_once_by_rounding_only_take_no_filter_away(name: str) -> None:
+    given = MIXED_EQUATIONS[name]
+    plant = obsynth.DescriptorSystem(**given, Dw=[[0.0, 0.0], [0.0, 0.2], [0.0, 1.4]], dt=0.0)
+    design = obsynth.optimal_filter(plant, norm="h2")
+    assert design.report.passed
+    # The algebraic states solved for by hand: the last column of E is zero, and one combination of its rows is.
+    e, a = np.array(given["E"]), np.array(given["A"])
+    left = scipy.linalg.null_space(e.T).T
+    rows, rest = left @ a / (left @ a)[0, 3], np.eye(3)
+    into = np.vstack([rest, -rows[:, :3] @ rest])
+    driven = np.hstack([np.array(given["Bf"]), np.array(given["Bw"])])
+    added = np.vstack([np.zeros((3, 3)), -(left @ driven) / (left @ a)[0, 3]])
+    right = np.linalg.lstsq(e[:, :3], np.hstack([a @ into, a @ added + driven]), rcond=None)[0]
+    c, through = plant.C @ into, plant.C @ added + np.hstack([plant.Df, plant.Dw])
+    explicit = obsynth.DescriptorSystem(
+        A=right[:, :3], Bf=right[:, 3:4], Bw=right[:, 4:], C=c, Df=through[:, :1], Dw=through[:, 1:], dt=0.0
+    )
+    other = obsynth.optimal_filter(
+        explicit, norm="h2", reference={part: np.array(design.options["reference"][part]) for part in "ABCD"}
+    )
+    own, same = design.certificate.claims, other.certificate.claims
+    assert own["least_deviation"] == pytest.approx(same["least_deviation"], rel=1e-6, abs=1e-6)
+    assert own["deviation"] == pytest.approx(own["least_deviation"], rel=1e-2, abs=1e-6)
+
+
+def test_a_filter_that_follows_no_state_but_by_rounding_follows_none() -> None:
+    # Index 2 without dynamics: no finite mode, and the outputs show derivatives of what drives the plant.
+    plant = obsynth.DescriptorSystem(
+        E=[[1.0, 0.0], [0.0, 0.0]],
+        A=[[0.0, 1.5], [0.5, 0.0]],
+        Bf=[[-0.5], [1.0]],
+        Df=[[1.5], [0.0], [0.5]],
+        Bw=[[1.0, -0.5], [-0.5, 1.0]],
+        C=[[-0.5, 1.0], [-0.5, -1.5], [1.0, 1.0]],
+        dt=0.0,
+    )
+    design = obsynth.optimal_filter(plant, norm="h2", reference={"bandwidth": 2.0})
+    claims = design.certificate.claims
+    # Three outputs show the three signals: all is known.
+    assert claims["least_deviation"] == 0.0
+    assert claims["deviation"] < 1e-6

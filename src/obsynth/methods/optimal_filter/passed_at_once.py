@@ -18,15 +18,15 @@ from obsynth.methods.optimal_filter.realisation import Followed, left_kernel_of
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE, but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.plant_units import PlantUnits
 
 #: Corrections, each by what the last one left: a small D keeps its digits.
 CORRECTIONS = 3
-#: Entries of D below this share of the largest of their row are rounding of the corrections: what they leave is less
-#: than what verification takes for the rounding of a row, 1e4 units in its last place.
+#: Entries of D below this share of the largest of their row, before or after, are rounding of the corrections: what
+#: they leave is less than what verification takes for the rounding of a row, 1e4 units in its last place.
 ROUNDED_SHARE = 1e-13
 
 
@@ -54,10 +54,16 @@ def without_white_noise(plant: DescriptorSystem, fault_map: FaultMap, filters: l
 
 
 def _shown_at_once(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what outputs show of faults, disturbances and noise of infinite frequency; the index is at most 1."""
-    answered = plant.C @ _answer(plant)
+    """Return what outputs show of faults, disturbances and noise of infinite frequency; the index is at most 1.
+
+    Nothing but rounding of a signal would count as much as others, which are corrected in units of their own.
+    """
+    answer = _answer(plant)
+    answered, size = plant.C @ answer, np.abs(plant.C) @ np.abs(answer)
     ways = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
-    faults, disturbances, noise = (through - answered @ driven for driven, through in ways)
+    faults, disturbances, noise = (
+        but_rounding(through - answered @ driven, np.abs(through) + size @ np.abs(driven)) for driven, through in ways
+    )
     return faults, disturbances, noise
 
 
@@ -69,16 +75,16 @@ def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
     index = structure_of(plant).index
     if follower.lag or index == 0:
         return follower
-    if index != 1:
-        return _without_rounding_passed(plant, fault_map, follower)
-    answer = _answer(plant)
-    return follower._replace(T0=_product_without_rounding(follower.D, plant.C, answer))
+    if index == 1:
+        follower = follower._replace(T0=_product_without_rounding(follower.D, plant.C, _answer(plant)))
+    return _without_rounding_passed(plant, fault_map, follower)
 
 
 def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
     """Return a filter whose D and T0, changed by rounding of each entry, pass at once what the fault map passes.
 
-    Of an index of 2 or more what passes by the states hangs on T, too: ``D Dw - T0 Bw`` is what is stored of it.
+    Of an index of 2 or more what passes by the states hangs on T, too: ``D Dw - T0 Bw`` is what is stored of it.  Of
+    index 1 a T0 that cancels but for the digits that D has lost is nothing.
     """
     kernel = left_kernel_of(plant.E)
     weights, reference, none = fault_map.weights, fault_map.reference, np.zeros((len(follower.D), plant.nd))
@@ -127,6 +133,9 @@ def _answer(plant: DescriptorSystem) -> FloatArray:
 
 
 def _corrected(d: FloatArray, shown: FloatArray, wanted: FloatArray, inverse: FloatArray) -> FloatArray:
+    # Where nothing may pass, what the corrections leave of D is rounding of its first entries.
+    largest = np.max(np.abs(d), axis=1, initial=0.0)
     for _ in range(CORRECTIONS):
         d = d - (d @ shown - wanted) @ inverse
-    return np.where(np.abs(d) > ROUNDED_SHARE * np.max(np.abs(d), axis=1, initial=0.0)[:, None], d, 0.0)
+    largest = np.maximum(largest, np.max(np.abs(d), axis=1, initial=0.0))
+    return np.where(np.abs(d) > ROUNDED_SHARE * largest[:, None], d, 0.0)

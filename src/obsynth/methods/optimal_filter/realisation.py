@@ -301,9 +301,13 @@ def _cleaned_solution(
     """Return the solution without entries that are rounding, and the share to which it holds; ``None`` for none."""
     exact, units = _solved(system, wanted[0])
     sizes = np.abs(exact) / units
+    # Where all of the right side cancels, what is left of it makes nothing but rounding.
+    rows = np.max(np.abs(system), axis=1, initial=0.0)
+    own = rows > RANK_TOLERANCE * np.max(rows, initial=0.0)
+    largest = max(np.max(sizes, initial=0.0), np.max(wanted[1][own] / rows[own], initial=0.0))
     for share in IDENTITIES_LEFT:
         for cleaned in CLEANED_SHARES:
-            solution = np.where(sizes > cleaned * np.max(sizes, initial=0.0), exact, 0.0)
+            solution = np.where(sizes > cleaned * largest, exact, 0.0)
             if not _holds(system, solution, wanted, heights, width, share):
                 break
             if not _shows_a_disturbance(system, solution, wanted, heights, disturbances):
