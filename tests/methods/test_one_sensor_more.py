@@ -161,3 +161,27 @@ def test_the_least_gain_with_a_dependent_sensor_is_proved(combination: list[floa
     fewer = {**matrices, "least_gain_outputs": matrices["least_gain_outputs"][:1]}
     forged = design.replace(certificate=replace(design.certificate, matrices=fewer))
     assert not obsynth.verify(forged)["least gain"].passed
+
+
+def test_a_noisy_sensor_more_costs_no_noise_at_a_stated_decay() -> None:
+    # The drive that keeps a filter awake is of the size of all sensors' noise: the default was faster than asked.
+    rows = [[-0.345, -1.91, 0.567, 0.862], [0.745, 0.155, 0.333, -0.507], [0.695, -0.191, -0.396, 1.415]]
+    process, noise = np.array([[-0.053], [0.036], [0.031], [0.121]]), [0.0125, 0.023, 0.55]
+    deviations = []
+    for count in (2, 3):
+        plant = obsynth.DescriptorSystem(
+            A=[[-1.266, -0.325, 0.009, -1.223], [0.697, -0.721, 0.946, -1.383],
+               [0.646, 0.36, -2.385, 0.018], [-1.335, 0.241, -1.272, -0.795]],
+            Bf=[[0.693], [-0.392], [0.395], [-0.493]], C=rows[:count],
+            Bw=np.hstack([process, np.zeros((4, count))]),
+            Dw=np.hstack([np.zeros((count, 1)), np.diag(noise[:count])]), dt=0.0,
+        )  # fmt: skip
+        design = obsynth.ui_pi_observer(plant, decay=0.5)
+        assert 0.5 <= design.certificate.claims["decay"] < 0.55
+        run, n = design.observer, plant.nx
+        a = np.block([[plant.A, np.zeros((n, run.order))], [run.By @ plant.C, run.Az]])
+        b = np.vstack([plant.Bw, run.By @ plant.Dw])
+        c = np.hstack([run.Dy[run.fault_rows] @ plant.C, run.Cz[run.fault_rows]])
+        spread = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
+        deviations.append(float(np.sqrt((c @ spread @ c.T).item())))
+    assert deviations[1] <= 1.001 * deviations[0]

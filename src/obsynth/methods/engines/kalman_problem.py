@@ -6,7 +6,8 @@ The default needs no numbers: as fast as a fixed price in noise allows.  This co
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,15 +88,27 @@ class KalmanProblem:
                 best, change, rate = gain, moved, further
         return best if rate == decay else None
 
-    def quietest_gain(self, decay: float) -> FloatArray | None:
+    def quietest_gain(self, decay: float, *, drives: Sequence[float] = (1.0,)) -> FloatArray | None:
         """Return the gain of the least prescribed rate whose poles all decay at ``decay`` (1/s) or faster; ``None``
-        when the equation has none.  Poles of a rate lie well beyond it, which costs noise."""
+        when the equation has none.  Poles of a rate lie well beyond it, which costs noise.
+
+        ``drives``: shares of the drive, the whole first: a filter that is kept awake by less of it may be quieter."""
+        best, noise = self._quietest_of_drive(decay)
+        for share in drives[1:] if best is not None and best.size else ():
+            gain, less = replace(self, drive=share * self.drive)._quietest_of_drive(decay)
+            if gain is None or not np.all(less <= noise):
+                break
+            best, noise = gain, less
+        return best
+
+    def _quietest_of_drive(self, decay: float) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of `quietest_gain` for this drive, and the deviation of each estimate."""
         start = np.eye(self.F.shape[0])
         best, change = self.solved(decay, start)
-        if best is None or not best.size or decay == 0.0:
-            return best
+        noise = np.zeros(0) if best is None or not best.size else self.deviations(best, change)
+        if not noise.size or decay == 0.0:
+            return best, noise
         wanted, low, high = WELL_REACHED * decay, 0.0, decay
-        noise = self.deviations(best, change)
         for _ in range(RATE_BISECTIONS):
             middle = 0.5 * (low + high) if low > 0.0 else FIRST_SHARE * high
             gain, change = self.solved(middle, start)
@@ -107,7 +120,7 @@ class KalmanProblem:
             if not np.all(less <= noise):
                 break
             best, noise, high = gain, less, middle
-        return best
+        return best, noise
 
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""

@@ -53,6 +53,10 @@ RADIUS_SHARE = 0.5
 
 Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
 
+#: Shares of the drive that are tried for a decay that is stated, while each is quieter than the last: the default is of
+#: the size of all sensors' noise, and a noisy sensor more made the filter faster than asked, and noisier.
+DRIVES = (1.0, 1e-1, 1e-2, 1e-3)
+
 #: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
@@ -253,7 +257,9 @@ def _chosen(
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, method)
         runs = (record,)
     elif method.decay is not None:
-        gain = _for_decay(problem, kalman, method.decay, method.objective, dt)
+        # What the user says of the drive is not ours to change.
+        drives = DRIVES if weights.keys().isdisjoint(("process", "fault")) else DRIVES[:1]
+        gain = _for_decay(problem, kalman, method.decay, method.objective, dt, drives=drives)
     elif (fair := compromise(kalman, problem.rate)) is not None:
         gain, claims = fair[0], {"noise_price": fair[2]}
     else:
@@ -297,12 +303,20 @@ def _as_fast_as(
     return both, best, {"noise_price": price}
 
 
-def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float) -> FloatArray:
+def _for_decay(
+    problem: PlacementProblem,
+    kalman: KalmanProblem,
+    decay: float,
+    objective: str,
+    dt: float,
+    *,
+    drives: Sequence[float] = DRIVES[:1],
+) -> FloatArray:
     """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
 
     Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
     rate = problem.units.time * decay
-    gain = kalman.quietest_gain(rate)
+    gain = kalman.quietest_gain(rate, drives=drives)
     if gain is None:
         gain = kalman.gain(rate, persistent=True)
     if gain is not None:
