@@ -33,6 +33,8 @@ WIDTH = 96
 #: Seconds above which a block is named in the log of the build: pages are made at every build.
 SLOW = 5.0
 
+#: What is removed at the end, the folder of each page in it, and the names of each page's code.
+_ROOTS: list[Path] = []
 _FOLDERS: dict[str, Path] = {}
 _NAMES: dict[str, dict[str, Any]] = {}
 
@@ -140,7 +142,7 @@ def _folder(directive: SphinxDirective) -> Path:
     """Return the folder of a page, with the files in it that the block asks for."""
     name = directive.env.docname
     if name not in _FOLDERS:
-        _FOLDERS[name] = Path(tempfile.mkdtemp(prefix="shown-"))
+        _FOLDERS[name] = Path(tempfile.mkdtemp(dir=_ROOTS[0]))
     folder = _FOLDERS[name]
     for path in _files(directive):
         directive.env.note_dependency(str(path))
@@ -234,9 +236,14 @@ def _tell(directive: SphinxDirective, began: float) -> None:
         LOGGER.info("%s, line %d: %.1f s", directive.env.docname, directive.lineno, seconds)
 
 
+def _begin(_: Sphinx) -> None:
+    """Make the folder of all pages before processes are forked, whose own are forgotten with them."""
+    _ROOTS.append(Path(tempfile.mkdtemp(prefix="shown-")))
+
+
 def _remove(_: Sphinx, __: Exception | None) -> None:
-    for folder in _FOLDERS.values():
-        shutil.rmtree(folder, ignore_errors=True)
+    while _ROOTS:
+        shutil.rmtree(_ROOTS.pop(), ignore_errors=True)
     _FOLDERS.clear()
     _NAMES.clear()
 
@@ -246,5 +253,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("shown", Shown)
     app.add_directive("shown-python", ShownPython)
     app.add_directive("shown-file", ShownFile)
+    app.connect("builder-inited", _begin)
     app.connect("build-finished", _remove)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -2,10 +2,12 @@
 Methods side by side
 ====================
 
-The picture of `obsynth.compare`: estimates of every method on the same scenario.
+The picture of `obsynth.compare`: estimates of several methods on the same scenario (without `methods`, of every one
+that exists for the plant).
 """
 
 import obsynth
 
 spec = obsynth.load_spec("../examples/thermal/spec.yaml")
-obsynth.compare(spec.plant, scenario=spec.scenario, runs=5).plot()
+methods = ["fault-estimation-filter", "pd-observer", "ui-pi-observer"]
+obsynth.compare(spec.plant, methods=methods, scenario=spec.scenario, runs=5).plot()

@@ -10,5 +10,5 @@ import obsynth
 
 spec = obsynth.load_spec("../../designs/drive/spec.yaml")
 design = obsynth.design(spec.plant, spec.method, name=spec.name, **spec.options)
-study = obsynth.tolerance_study(design, spec.scenario, tolerances=(0.0, 0.01, 0.02, 0.05), runs=10)
+study = obsynth.tolerance_study(design, spec.scenario, tolerances=(0.0, 0.02, 0.05), runs=5)
 obsynth.plotting.plot_tolerances(study)

@@ -304,6 +304,22 @@ def test_sensitivity_is_refuted_between_the_points_of_a_grid() -> None:
     assert sensitivity_is_proved(notch, 0.2, 2.0, 10.0)
 
 
+def test_sensitivity_is_proved_far_beyond_the_rates_of_a_plant() -> None:
+    # Heat in joules and kelvin: rates of 1e-3 1/s below a band that ends at 1e3 rad/s. In norms of equal weights an
+    # interval was a hundred-millionth of the band, and nothing was proved after twenty thousand of them.
+    spec = obsynth.load_spec(Path(__file__).parents[2] / "docs/examples/thermal/spec.yaml")
+    assert spec.transformation is not None
+    oven = spec.transformation.source
+    found = obsynth.detection_filter(oven)
+    system, observer = found.plant, found.observer
+    shown = [
+        np.linalg.svd(observer.Dy @ transfer(system, observer.By, system.Bf, system.Df, w), compute_uv=False)
+        for w in (0.0, *np.geomspace(1e-6, 1e3, 300))
+    ]
+    least = float(np.min(shown))
+    assert 0.999 * least < found.fault_sensitivity <= least
+
+
 def test_refusals() -> None:
     system = plant()
     with pytest.raises(obsynth.PreconditionError, match="lacks row rank"):

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov
@@ -34,8 +35,11 @@ SHORTEST_INTERVAL = 1e-8
 #: A range of frequencies that is shorter begins with intervals as if it had this length.
 LEAST_RANGE = 1e-9
 
-#: Weight of the equations that the frequency does not enter: a power of two.
-LIGHT = 2.0**-20
+#: Share of the least norm that is left to equations that the frequency does not enter.
+LIGHT = 0.25
+
+#: Steps towards the weights in which norms are least, and the least share of a weight's inverse.
+PERRON_STEPS, LEAST_PERRON_SHARE = 8, 2.0**-60
 
 #: Units of states are not taken further apart than two to this.
 MOST_EXPONENT = 200
@@ -156,13 +160,30 @@ def _regular_around(pencil: Ball, n: int, frequency: float) -> float:
     missed = Ball.exact(inverse_blocks) @ matrix - Ball.exact(np.eye(2 * size))
     # The frequency enters the equations of the states alone: the others count for little in weighted norms.
     states = np.r_[0 : 2 * n, size : size + 2 * n]
-    weights = np.full(2 * size, LIGHT)
-    weights[states] = 1.0
+    moved = np.abs(inverse_blocks[:, states])
+    weights = _weights(moved, states)
     error_norm = _row_sum((np.abs(missed.midpoint) + missed.radius) * weights[:, None] / weights)
-    speed = _row_sum(np.abs(inverse_blocks[:, states]) * weights[:, None])
+    speed = _row_sum(moved * weights[:, None] / weights[states])
     if not error_norm < 1.0 or not np.isfinite(speed):
         return -1.0
     return REACH * (1.0 - error_norm) / speed if speed > 0.0 else np.inf
+
+
+def _weights(moved: FloatArray, states: NDArray[np.intp]) -> FloatArray:
+    """Return weights of the equations in which the largest row sum of ``moved``, whose columns are those of the states,
+    is near its least, the spectral radius: Perron's vector; powers of two, so that they round nothing."""
+    shares, largest = np.ones(len(states)), 0.0
+    with np.errstate(all="ignore"):
+        for _ in range(PERRON_STEPS):
+            following = moved[states] @ shares
+            largest = float(np.max(following, initial=0.0))
+            shares = np.maximum(following / largest, LEAST_PERRON_SHARE)
+        effects = moved @ shares
+        effects[states] = shares
+        others = np.setdiff1d(np.arange(len(moved)), states)
+        effects[others] = np.maximum(effects[others] / (LIGHT * largest), LEAST_PERRON_SHARE)
+        weights: FloatArray = np.exp2(-np.round(np.log2(effects)))
+    return weights if np.all(np.isfinite(weights)) and np.all(weights > 0.0) else np.ones(len(moved))
 
 
 def _row_sum(sizes: FloatArray) -> float:
