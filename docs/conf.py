@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import sys
 from importlib.util import find_spec
@@ -10,6 +11,9 @@ from pathlib import Path
 import obsynth
 
 HERE = Path(__file__).parent
+# A build keeps nearly all it makes: a tenth of its time went to looking for what it does not.
+gc.freeze()
+gc.set_threshold(100_000, 20, 20)
 sys.path[:0] = [str(HERE), str(HERE / "_ext")]
 from site_sources import write_sources  # noqa: E402
 
