@@ -387,6 +387,10 @@ def test_the_summary_lists_alarms_and_rows_that_could_not_alarm() -> None:
     assert sum(run.silent.values()) == len(table) - could
     printed = summary_of_run(run, None)
     assert "alarm by" in printed
+    assert " kW" not in printed
+    rows = [line for line in summary_of_run(run, None, {"f": "kW"}).splitlines() if line.startswith("  fhat[f]")]
+    assert len(rows) == len(run.events)
+    assert all(" kW" in row for row in rows)
     assert f"{len(table) - could} of 160 rows: " in printed
     quiet = summary_of_run(obsynth.run_on_data(designed("ui-pi-observer"), log(), thresholds={"fhat[f]": 50.0}), None)
     assert "No alarm by any threshold in the" in quiet

@@ -426,3 +426,21 @@ def test_damaged_files_are_read_or_refused_in_a_sentence(design, frame, tmp_path
         if code == 2:
             assert told.startswith("Error: ")
             assert {path.name for path in tmp_path.iterdir()} == kept
+
+
+@pytest.mark.parametrize("kind", ["random", "random after a mark of UTF-16", "zeros", "a picture"])
+def test_binary_data_is_called_so(kind: str, design, tmp_path, capsys, monkeypatch) -> None:
+    """It was "no UTF-16 text: save it as UTF-8"; of zeros, 4,000 of them stood in the message."""
+    random = np.random.default_rng(5).bytes(4001)
+    content = {
+        "random": random, "random after a mark of UTF-16": b"\xff\xfe" + random, "zeros": bytes(4000),
+        "a picture": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + random,
+    }[kind]  # fmt: skip
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(SpecError, match=r"log\.csv holds binary data, and no table of text") as caught:
+        obsynth.run_on_data(design, tmp_path / "log.csv")
+    assert len(str(caught.value)) < 600
+    gains = design.save(tmp_path / "tank.gains.json")
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content), encoding="utf-8"))
+    assert main(["run", "--gains", str(gains), "--data", "-", "--out", str(tmp_path / "out.csv")]) == 2
+    assert "binary data" in capsys.readouterr().err

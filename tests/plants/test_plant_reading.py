@@ -127,3 +127,13 @@ def test_a_bias_has_no_operating_point_though_it_is_called_like_its_sensor(tmp_p
     (path,) = obsynth.export(design, tmp_path / "observer.npz")
     saved = np.load(path)
     assert dict(zip(saved["output_names"], saved["output_point"], strict=True))["fhat[flow]"] == 0.0
+
+
+def test_a_call_by_position_is_told_that_the_first_argument_is_e():
+    with pytest.raises(obsynth.SpecError, match="first argument is E: give A="):
+        obsynth.DescriptorSystem([[0.9, 0.1], [0.0, 0.8]], [[1.0], [0.0]], [[1.0, 0.0]])
+    for e in (None, [[1.0], [2.0, 3.0]], np.eye(3)):
+        with pytest.raises(obsynth.SpecError) as caught:
+            obsynth.DescriptorSystem(e, [[1.0], [0.0]], C=[[1.0, 0.0]])
+        assert "must be square" in str(caught.value)
+        assert "first argument" not in str(caught.value)

@@ -116,7 +116,7 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
         )
         yield stacked("", text, count, lambda axes: plot_data(without_statement, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
-    rows, more = alarm_rows(run.events, run.stamps.shown)
+    rows, more = alarm_rows(run.events, run.stamps.shown, design.plant.units)
     if rows:
         yield "<h3>Alarms</h3>"
         yield from table_lines(rows[0], rows[1:])

@@ -233,7 +233,8 @@ def checked_poles(
     if len(listed) != count:
         fixed_text = ", ".join(pole_text(complex(value), 6) for value in fixed)
         besides = f" (fixed, not to be listed: {fixed_text})" if fixed_text else ""
-        problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
+        number = f"{len(listed)} {'is' if len(listed) == 1 else 'are'} given"
+        problems.append(f"{number}, but {count} can be placed{besides}.")
     rates = decay_rates(listed, dt)
     unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
     if unstable:
@@ -252,7 +253,8 @@ def checked_poles(
             lower.remove(partner)
     lonely += lower
     if lonely:
-        problems.append(f"{', '.join(f'{pole:.6g}' for pole in lonely)} lack their conjugates.")
+        poles = ", ".join(pole_text(pole, 6) for pole in lonely)
+        problems.append(f"{poles} {'lacks its conjugate' if len(lonely) == 1 else 'lack their conjugates'}.")
     if problems:
         raise SpecError(f"Option poles of {of}:", path=_POLES_OPTION, problems=problems)
     real = [pole for pole in listed if pole.imag == 0.0]

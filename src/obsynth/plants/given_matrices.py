@@ -139,7 +139,10 @@ def plant_fields(
             path="A",
         )
     if nx == 0 or a.shape[1] != nx:
-        raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
+        remedy = (
+            " The first argument is E: give A=..., B=... and C=... by name." if _is_square(matrices["E"], nx) else ""
+        )
+        raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).{remedy}", path="A")
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
     problems.raise_if_any()
     checked: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
@@ -185,6 +188,14 @@ def plant_fields(
     values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))
     problems.raise_if_any()
     return values
+
+
+def _is_square(matrix: Any, rows: int) -> bool:
+    """Whether E is given with so many rows and columns: a call by position has A in its place."""
+    try:
+        return matrix is not None and any_matrix(matrix, "E").shape == (rows, rows)
+    except SpecError:
+        return False
 
 
 def _identity_like(a: Any) -> Any:

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from obsynth.monitoring.logs.clock import OUT_OF_ORDER, REPEATED_STAMP
 from obsynth.monitoring.logs.log_observer import GAP, OUT, PARTIAL, RECOVERING, WARM_UP
-from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
+from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, SENSOR, Ranking
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.observers.estimates import BAND_WIDTH
@@ -265,23 +265,26 @@ class AlarmLog:
         return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
 
 
-def alarm_rows(events: Sequence[AlarmEvent], date_of: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
-    """Return a table of alarms, heading first and without empty columns, and how many more there are."""
+def alarm_rows(
+    events: Sequence[AlarmEvent], date_of: Callable[[float], str], units: Mapping[str, str] | None = None
+) -> tuple[list[tuple[str, ...]], int]:
+    """Return a table of alarms, heading first and without empty columns, and how many more there are; ``units``: of
+    faults and outputs, by name."""
     if not events:
         return [], 0
-
-    def number(value: float) -> str:
-        return "" if math.isnan(value) else f"{value:.4g}"
 
     heading = ("alarm by", "from", "to", "rows", "fault", "size", "interval", "peak / threshold", BEYOND_HEADING)
     rows: list[tuple[str, ...]] = [heading]
     for event in events[:MOST_LISTED_ALARMS]:
-        interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
+        unit = (units or {}).get(event.fault.removeprefix(SENSOR), "1")
+        unit = "" if unit == "1" else f" {unit}"
+        size = "" if math.isnan(event.size) else f"{event.size:.4g}{unit}"
+        interval = "" if math.isnan(event.low) else f"{event.low:.4g} to {event.high:.4g}{unit}"
         interval += " (not valid)" if interval and not event.valid else ""
         ends = date_of(event.start), date_of(event.end)
         fault = fault_text(event, date_of)
         peak, beyond = f"{event.evidence:.3g}", ", ".join(event.beyond)
-        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, peak, beyond))
+        rows.append((event.by, *ends, str(event.rows), fault, size, interval, peak, beyond))
     nonempty = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in nonempty) for row in rows], len(events) - len(rows) + 1
 

@@ -51,6 +51,15 @@ WINDOWS_TEXT = "obsynth.windows"
 #: What helps where a file is in another encoding than it seems to be.
 SAVE_AS_TEXT = "If another program reads it, save it there as UTF-8."
 
+#: What is said of a file that is no text in any encoding.
+BINARY = (
+    "{name} holds binary data, and no table of text. Export it as CSV from the program that wrote it, or let its name "
+    "end as is usual for its kind (.parquet, .mat, .npz, .mf4, .tdms)."
+)
+
+#: Characters below the space that a text may have.
+CONTROLS_IN_TEXTS = frozenset("\t\n\v\f\r\x1a")
+
 
 def number_in_cell(
     text: str | None, row: int, column: str, stamps: Stamps | None = None, *, comma: bool = False
@@ -115,8 +124,20 @@ def encoding_of(stream: BufferedIOBase) -> str:
 
 def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
     """Return what is told of a file whose bytes are no text."""
+    if _is_binary(error):
+        return SpecError(BINARY.format(name=path), path=str(path))
     name = next((name for name in ("UTF-16", "UTF-32") if error.encoding.upper().startswith(name)), "UTF-8")
     return SpecError(f"{path} is no {name} text (byte {error.start}). {SAVE_AS_TEXT}", path=str(path))
+
+
+def _is_binary(error: UnicodeDecodeError) -> bool:
+    """Whether bytes are no text with a flaw: they have characters that no text has, or hardly any of a table."""
+    text = error.object.decode(error.encoding, "replace")
+    return _has_controls(text) or 2 * sum(map(str.isascii, text)) < len(text)
+
+
+def _has_controls(text: str) -> bool:
+    return any(character < " " and character not in CONTROLS_IN_TEXTS for character in text)
 
 
 def text_chunks(
@@ -188,6 +209,9 @@ def opened_text(
     head = next(lines, "") if separator_line else head
     if not separator_line and not _named(head, wanted):
         head, lines = _after_remarks(head, lines, wanted, notes)
+    # A logger that lost its power leaves a file of zeros.
+    if "\0" in head:
+        raise SpecError(BINARY.format(name=getattr(stream, "name", "The log")), path="data")
     separator = separator_line.group(1) if separator_line else _separator_of(head, wanted)
     # A name in quotes may go on in the next line.
     table = _cells(itertools.chain([head], lines), separator)
@@ -260,9 +284,10 @@ def _text_lines(stream: TextIO) -> Iterator[str]:
             block = stream.readline()
         except UnicodeDecodeError as error:
             name = getattr(stream, "name", "The data")
-            raise SpecError(
-                f"{name} is no text of its encoding after line {count}. {SAVE_AS_TEXT}", path="data"
-            ) from error
+            if _is_binary(error):
+                raise SpecError(BINARY.format(name=name), path="data") from error
+            place = f"after line {count}" if count else "in its first line"
+            raise SpecError(f"{name} is no text of its encoding {place}. {SAVE_AS_TEXT}", path="data") from error
         if not block:
             return
         for line in _OLD_LINES.findall(block):

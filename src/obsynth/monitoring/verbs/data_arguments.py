@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -154,8 +155,8 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
     )
 
 
-def summary_of_run(run: DataRun, watched: Monitor | None) -> str:
-    """Return what a run was, in a few lines."""
+def summary_of_run(run: DataRun, watched: Monitor | None, units: Mapping[str, str] | None = None) -> str:
+    """Return what a run was, in a few lines; ``units``: of the plant's signals, by name."""
     from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence, time_in_alarm
 
     counts = ", ".join(f"{count} {status}" for status, count in run.statuses.items())
@@ -173,7 +174,7 @@ def summary_of_run(run: DataRun, watched: Monitor | None) -> str:
         fault = f" Probable fault: {first.fault}." if clear and first is not None else ""
         by = f"threshold of {name}" if name in run.thresholds else f"monitor: {name}"
         lines.append(f"First alarm {run.stamps.shown(time)} ({by}).{fault}")
-    rows, more = alarm_rows(run.events, run.stamps.shown)
+    rows, more = alarm_rows(run.events, run.stamps.shown, units)
     table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
     lines += [*(f"  {line}" for line in table), *alarm_notes(run.events), *time_in_alarm(run.events, run.rows)]
     if watched is not None or run.thresholds:

@@ -70,7 +70,7 @@ def run_run(options: argparse.Namespace) -> int:
     elif not options.quiet:
         # The estimates themselves may be on stdout.
         stream = sys.stderr if out is sys.stdout else sys.stdout
-        print(*([mark] if mark else []), summary_of_run(run, watched), sep="\n", file=stream)
+        print(*([mark] if mark else []), summary_of_run(run, watched, design.plant.units), sep="\n", file=stream)
         if proof is not None:
             print(proof["statement"], *(["Certificate:", proof["file"]] if proof["file"] else []), file=stream)
     return 0
@@ -169,7 +169,7 @@ def run_plot(options: argparse.Namespace) -> int:
         plot_data(run, design=design, show=parts)
         plt.show()
     if options.json or not options.quiet:
-        text = "\n".join([*([mark] if mark else []), summary_of_run(run, watched)])
+        text = "\n".join([*([mark] if mark else []), summary_of_run(run, watched, design.plant.units)])
         unverified = {"unverified": mark} if mark else {}
         emit(options, {"gains": options.gains, "file": target, **run.as_dict(), **unverified}, text)
     return 0
