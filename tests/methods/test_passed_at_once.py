@@ -70,3 +70,22 @@ def test_of_index_two_d_and_t0_pass_no_white_noise_but_by_rounding() -> None:
     assert not follower.D[1].any()
     assert not follower.T0[1].any()
     assert follower.D[0, 1] == 0.0
+
+
+def test_of_index_two_rounding_in_a_coordinate_of_t0_passes_no_white_noise() -> None:
+    """Where T0 is rounding, so are its coordinates that are small beside the others: what is left of them passed."""
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 0.0, 1.0, 0.0], k=1)[:4, :4], A=np.eye(4), Bf=np.zeros((4, 1)), C=np.eye(1, 4),
+        Bw=[[0.0], [2.0], [0.0], [3.0]], Dw=[[0.0]], dt=0.0,
+    )  # fmt: skip
+    assert not plant.E[[1, 3]].any()
+    stated = Followed(
+        *(np.zeros(shape) for shape in ((0, 0), (0, 1), (1, 0))),
+        D=np.zeros((1, 1)),
+        T=np.zeros((0, 4)),
+        T0=np.array([[0.0, 1e-12, 0.0, 1e-28]]),
+        lag=0,
+    )
+    models = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1))
+    follower = with_digits_of(plant, FaultMap(None, models, exact=False), stated)
+    assert not follower.T0.any()

@@ -102,6 +102,7 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
     shown = np.hstack([faults, disturbances, noise])
     wanted = np.hstack([passed, none, np.zeros((len(passed), noise.shape[1]))])
     rows = np.hstack([follower.D, follower.T0[:, : plant.nx] @ np.linalg.pinv(kernel)])
+    kernel_sizes = np.linalg.norm(kernel / PlantUnits.of(plant).equations, axis=1)
     for i, row in enumerate(rows):
         # What passes of an input is rounding beside its own terms, as it is verified.
         entries = np.abs(row)
@@ -111,8 +112,10 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
         inverse = np.linalg.pinv(terms / sizes, rcond=RANK_TOLERANCE)
         for _ in range(CORRECTIONS):
             row = row - (((row @ shown - wanted[i]) / sizes) @ inverse) * entries
-        # Of what was nothing but rounding nothing is left.
-        rows[i] = np.where(np.abs(row) > ROUNDED_SHARE * entries, row, 0.0)
+        # Of what was nothing but rounding nothing is left, in any coordinate of T0.
+        largest = entries.copy()
+        largest[plant.ny :] = np.max(kernel_sizes * entries[plant.ny :], initial=0.0) / kernel_sizes
+        rows[i] = np.where(np.abs(row) > ROUNDED_SHARE * largest, row, 0.0)
     return follower._replace(D=rows[:, : plant.ny], T0=rows[:, plant.ny :] @ kernel)
 
 
