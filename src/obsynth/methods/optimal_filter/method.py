@@ -59,7 +59,8 @@ class OptimalFilterMethod(Method):
     order_limit : int, optional
         Most states of the filter, for small processors.  Where the filter of least gain has more, one of that order
         with the same fault map and decoupling is searched; its own gain is claimed beside ``least``, which is of
-        filters of any order.  It is a local minimum: no claim says that it is the best of its order.
+        filters of any order.  It is a local minimum: no claim says that it is the best of its order.  Neither the
+        plant's state nor known inputs drive its error; one that is cut without that may have less gain.
     steady_error_limit : float, optional
         Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
         design beyond it is refused.
