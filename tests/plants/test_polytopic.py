@@ -44,6 +44,30 @@ def test_functions_of_parameters_are_enclosed_and_shared() -> None:
     assert bounds["sin(v)"][1] == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("texts", "functions"),
+    [
+        (["0.2 * p * sin(q)", "p * (0.3 * sin(q))", "-sin(q) * p / 7"], ("p * sin(q)",)),
+        (["(2 * p) ** 2", "p * p", "3 * p ** 2 - q"], ("q", "p ** 2")),
+        (["0.2 * p / (3 * q)", "p / q"], ("p / q",)),
+        (["p * (1 + q)", "p * q", "p"], ("p", "p * q")),
+        (["(1 + 0.2 * p) * sin(q)"], ("(1 + 0.2 * p) * sin(q)",)),
+        (["p * (1 + q) - p * q"], ("(1 + q) * p", "p * q")),
+    ],
+)
+def test_multiples_of_one_function_are_one(texts: list[str], functions: tuple[str, ...]) -> None:
+    """Each function doubles the vertices: 0.2 p sin(q) and 0.3 p sin(q) were two."""
+    plant = PolytopicSystem(
+        plant={"A": np.eye(len(texts)).tolist(), "C": np.eye(len(texts)).tolist(), "Bd": [[text] for text in texts]},
+        scheduling={"p": [0.5, 2], "q": [0.25, 3]},
+    )
+    assert plant.scheduling.functions == functions
+    assert plant.count == 2 ** len(functions)
+    values = {"p": 1.25, "q": 0.75}
+    written = [eval(text, {"sin": np.sin, **values}) for text in texts]
+    assert plant.at(values).Bd.ravel() == pytest.approx(written, abs=1e-14)
+
+
 def test_what_is_saved_is_the_plant_again() -> None:
     plant = _pendulum()
     for again in (pickle.loads(pickle.dumps(plant)), PolytopicSystem(**plant.as_dict())):

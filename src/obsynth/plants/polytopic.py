@@ -321,7 +321,7 @@ def _from_expressions(
     both = sorted(set(parameters) & set(constants))
     if both:
         raise SpecError(f"{both[0]!r} is both a scheduling parameter and a constant.", path=f"scheduling.{both[0]}")
-    arguments, forms = dict(plant_arguments), dict[str, list[tuple[int, int, LinearForm]]]()
+    arguments = dict(plant_arguments)
     if expressions_in(arguments.get("E"))[1]:
         raise PreconditionError(
             "E has an expression: with a matrix E(mu) beside the next state a proof at the vertices says nothing of "
@@ -329,18 +329,14 @@ def _from_expressions(
             "derivative.",
             condition="constant E",
         )
+    written: dict[str, list[tuple[int, int, str]]] = {}
     for name in SCHEDULED_MATRICES:
-        arguments[name], entries = expressions_in(arguments.get(name))
-        forms[name] = [
-            (row, column, _form(text, f"{name}[{row + 1},{column + 1}]", constants, tuple(parameters)))
-            for row, column, text in entries
-        ]
-    functions = list(parameters)
-    for form in (form for entries in forms.values() for _, _, form in entries):
-        functions += [text for text in form.parts if text not in functions]
-    used = {text for entries in forms.values() for _, _, form in entries for text in form.parts}
-    needed = {name for text in used for name in parse_expression(text).names}
-    idle = [name for name in parameters if name not in needed]
+        arguments[name], written[name] = expressions_in(arguments.get(name))
+    # Each function doubles the vertices: products of sums are expanded where that makes fewer, and loses no parameter.
+    choices = [_forms(written, constants, tuple(parameters), expanded=expanded) for expanded in (False, True)]
+    forms, used = min(choices, key=lambda choice: (-len(_names_in(choice[1])), len(choice[1])))
+    functions = list(dict.fromkeys([*parameters, *used]))
+    idle = [name for name in parameters if name not in _names_in(used)]
     if idle:
         raise SpecError(
             f"No entry depends on {idle[0]!r}: leave it out of scheduling, or write it into an entry of the matrices.",
@@ -349,6 +345,30 @@ def _from_expressions(
     held = _scheduling(parameters, [text for text in functions if text in used])
     base = _descriptor({key: value for key, value in arguments.items() if value is not None})
     return tuple(_vertex(base, forms, dict(zip(held.functions, row, strict=True))) for row in held.corners), held
+
+
+def _forms(
+    written: Mapping[str, list[tuple[int, int, str]]],
+    constants: Mapping[str, float],
+    names: tuple[str, ...],
+    *,
+    expanded: bool,
+) -> tuple[dict[str, list[tuple[int, int, LinearForm]]], list[str]]:
+    """Return the entries of matrices as forms, and the functions that are in them, in their order."""
+    forms = {
+        matrix: [
+            (row, column, _form(text, f"{matrix}[{row + 1},{column + 1}]", constants, names, expanded=expanded))
+            for row, column, text in entries
+        ]
+        for matrix, entries in written.items()
+    }
+    parts = (text for entries in forms.values() for _, _, form in entries for text in form.parts)
+    return forms, list(dict.fromkeys(parts))
+
+
+def _names_in(functions: Sequence[str]) -> set[str]:
+    """Return the parameters that functions depend on."""
+    return {name for text in functions for name in parse_expression(text).names}
 
 
 def _descriptor(arguments: dict[str, Any]) -> DescriptorSystem:
@@ -360,7 +380,9 @@ def _descriptor(arguments: dict[str, Any]) -> DescriptorSystem:
         raise SpecError(f"plant: {error}.", path="plant") from error
 
 
-def _form(text: str, place: str, constants: Mapping[str, float], names: tuple[str, ...]) -> LinearForm:
+def _form(
+    text: str, place: str, constants: Mapping[str, float], names: tuple[str, ...], *, expanded: bool
+) -> LinearForm:
     try:
         expression = parse_expression(text)
     except SpecError as error:
@@ -373,7 +395,7 @@ def _form(text: str, place: str, constants: Mapping[str, float], names: tuple[st
             path=f"plant.{place}",
         )
     try:
-        return linear_form(expression, constants, names)
+        return linear_form(expression, constants, names, expanded=expanded)
     except SpecError as error:
         raise SpecError(f"{place} is {text!r}: {error}", path=f"plant.{place}") from None
     except (ValueError, ArithmeticError) as error:

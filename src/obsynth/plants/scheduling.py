@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -31,6 +32,10 @@ MOST_FUNCTIONS = 12
 WEIGHT_TOLERANCE = 1e-6
 #: What a step of a parameter may exceed its rate by, from rounding of logs; certificates allow for twice as much.
 RATE_TOLERANCE = 1e-6
+#: Powers that are written as repeated factors.
+SMALL_POWERS = range(2, 9)
+#: Products of sums that have more terms are left as they are.
+MOST_EXPANDED = 64
 #: Whole numbers below this one are written without a point.
 LARGEST_WHOLE = 1e15
 #: Keys of a parameter as it is given.
@@ -384,15 +389,28 @@ class LinearForm:
         """Return a multiple."""
         return LinearForm(self.constant * factor, {name: f * factor for name, f in self.parts.items() if f * factor})
 
+    @property
+    def monomial(self) -> tuple[Fraction, str] | None:
+        """Factor and function of a multiple of one function; `None` of anything else."""
+        if self.constant or len(self.parts) != 1:
+            return None
+        ((text, factor),) = self.parts.items()
+        return factor, text
 
-def linear_form(expression: Expression, constants: Mapping[str, float], names: Sequence[str]) -> LinearForm:
-    """Return an expression as a linear form of functions of parameters ``names``; ``constants`` are numbers."""
+
+def linear_form(
+    expression: Expression, constants: Mapping[str, float], names: Sequence[str], *, expanded: bool = False
+) -> LinearForm:
+    """Return an expression as a linear form of functions of parameters ``names``; ``constants`` are numbers.
+
+    Numbers are taken out of products, powers and quotients, so that multiples of one function are one; products of sums
+    are functions as they are, or sums of products where they are ``expanded``."""
     values: dict[str, Any] = {name: LinearForm(Fraction(0), {name: Fraction(1)}) for name in names}
     values |= {name: LinearForm.of(value) for name, value in constants.items() if name not in values}
-    return LinearForm.of(expression.translated(values, _linear_operation))
+    return LinearForm.of(expression.translated(values, partial(_linear_operation, expanded=expanded)))
 
 
-def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
+def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Callable[..., Any]:
     def done(*operands: Any) -> LinearForm:
         forms = [LinearForm.of(value) for value in operands]
         if not any(form.parts for form in forms) and operation not in (np.add, np.subtract, np.multiply, np.divide):
@@ -408,6 +426,15 @@ def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
             return forms[0].times(1 / forms[1].constant)
         if operation is np.power and not forms[1].parts and forms[1].constant in (0, 1):
             return forms[0] if forms[1].constant else LinearForm(Fraction(1))
+        if operation is np.multiply:
+            return _product(forms[0], forms[1], expanded=expanded)
+        if operation is np.power and not forms[1].parts and forms[1].constant in SMALL_POWERS and forms[0].monomial:
+            factor, text = forms[0].monomial
+            times = int(forms[1].constant)
+            return LinearForm(Fraction(0), {_text_of_factors(_factors(text) * times): factor**times})
+        if operation is np.divide and (forms[0].monomial or forms[1].monomial):
+            (above, x), (below, y) = (form.monomial or (Fraction(1), form.text) for form in forms)
+            return LinearForm(Fraction(0), {TEXTS_OF_OPERATIONS[operation](x, y): above / below})
         text = (
             TEXTS_OF_OPERATIONS[operation](*(form.text for form in forms)) if operation in TEXTS_OF_OPERATIONS else None
         )
@@ -420,6 +447,47 @@ def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
         return LinearForm(Fraction(0), {text: Fraction(1)})
 
     return done
+
+
+def _product(one: LinearForm, other: LinearForm, *, expanded: bool) -> LinearForm:
+    """Return the product of two forms that both move."""
+    if expanded and len(one.parts) * len(other.parts) <= MOST_EXPANDED:
+        total = one.times(other.constant).plus(other.times(one.constant), 1)
+        total = LinearForm(one.constant * other.constant, total.parts)
+        for (x, a), (y, b) in itertools.product(one.parts.items(), other.parts.items()):
+            total = total.plus(LinearForm(Fraction(0), {_text_of_factors([*_factors(x), *_factors(y)]): a * b}), 1)
+        return total
+    factor, factors = Fraction(1), list[str]()
+    for form in (one, other):
+        own, text = form.monomial or (Fraction(1), "")
+        factor *= own
+        factors += _factors(text) if text else [form.text]
+    return LinearForm(Fraction(0), {_text_of_factors(factors): factor})
+
+
+def _factors(text: str) -> list[str]:
+    """Return the factors of a function, as often as each is one: itself alone where it is no product."""
+    parts, depth, begun = list[str](), 0, 0
+    for i, character in enumerate(text):
+        depth += (character == "(") - (character == ")")
+        if depth == 0 and text[i : i + 3] in (" + ", " - ", " / "):
+            return [text]
+        if depth == 0 and text[i : i + 3] == " * ":
+            parts.append(text[begun:i])
+            begun = i + 3
+    factors = list[str]()
+    for part in [*parts, text[begun:]]:
+        base, _, power = part.rpartition(" ** ")
+        times = int(power) if base and power.isdigit() and int(power) in SMALL_POWERS else 0
+        factors += [base] * times if times else [part]
+    return factors
+
+
+def _text_of_factors(factors: list[str]) -> str:
+    """Return a product in one order of its factors, each of which is written once."""
+    # A factor that is a product of its own, or a sum, has its brackets already or gets them here.
+    counts = Counter(_bracketed(factor) for factor in factors)
+    return " * ".join(text if count == 1 else f"{text} ** {count}" for text, count in sorted(counts.items()))
 
 
 def _number(value: Fraction) -> str:
