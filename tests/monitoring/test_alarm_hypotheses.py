@@ -19,19 +19,21 @@ from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, ra
 ROWS, BEGIN = 900, 500
 
 
-def room_log(seed: int, *, air=0.0, wall=0.0, lost=0.0, drift=0.0) -> pd.DataFrame:
-    """Return rows of a room with a heavy wall, in fourths of a sample: what is off from `BEGIN` on, in K and W."""
+def room_log(seed: int, *, air=0.0, wall=0.0, lost=0.0, drift=0.0, later=0, air_later=0.0) -> pd.DataFrame:
+    """Return rows of a room with a heavy wall, in fourths of a sample: what is off from `BEGIN` on, in K and W; the
+    heater, and one thermometer, so many rows ``later``."""
     rng = np.random.default_rng(seed)
     valve, out = np.repeat(rng.uniform(0.3, 0.7, 18), 50), np.repeat(rng.uniform(2.0, 8.0, 5), 200)
     x, rows = np.array([20.0, 15.0]), []
     for k in range(ROWS):
-        faulty = float(k >= BEGIN)
+        faulty, faulty_later = float(k >= BEGIN), float(k >= BEGIN + later)
         for _ in range(4):
             between = 150.0 * (x[1] - x[0])
-            heat = 4000.0 * valve[k] - lost * faulty
+            heat = 4000.0 * valve[k] - lost * faulty_later
             x = x + 15.0 * np.array([(heat + between + 40.0 * (out[k] - x[0])) / 2e5,
                                      (80.0 * (out[k] - x[1]) - between) / 2e6])  # fmt: skip
         shown = x + 0.05 * rng.standard_normal(2) + faulty * np.array([air + drift * (k - BEGIN), wall])
+        shown[0] += air_later * faulty_later
         rows.append([60.0 * k, valve[k], out[k], *shown])
     return pd.DataFrame(rows, columns=["time", "valve", "out", "Tair", "Twall"])
 
@@ -79,6 +81,22 @@ def test_each_is_named_right(room):
     assert event_of(*room, room_log(9, wall=1.0)).fault == "sensor Twall"
     event = event_of(*room, room_log(9, lost=400.0))
     assert (event.fault, event.clear) == ("lost", True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("later", [40, 120])
+def test_a_fault_that_comes_while_an_alarm_stands_has_an_alarm_of_its_own(room, later: int):
+    """The effect of the first was in its rows, and it kept that name."""
+    design, learned = room
+    monitor = obsynth.online_monitor(design, "learned", normal=learned)
+    for log, names in (
+        (room_log(9, wall=1.0, lost=800.0, later=later), ["sensor Twall", "lost"]),
+        (room_log(9, wall=1.0, air_later=2.0, later=later), ["sensor Twall", "sensor Tair"]),
+    ):
+        events = obsynth.run_on_data(design, log, monitor=monitor).events
+        found = [event for event in events if event.last_row > BEGIN]
+        assert [event.fault for event in found] == names
+        assert 0 <= found[1].first_row - 1 - (BEGIN + later) <= 20
 
 
 @pytest.mark.long

@@ -34,8 +34,9 @@ NOT_VALID = (
 
 #: What is said of names where an alarm lasted for longer than changes are looked for.
 NAMED_BY_THE_FIRST = (
-    "An alarm keeps the name of what began it: another fault that came while it stood, or soon after, may have no name "
-    "of its own here. Its time is where the statistic of the output rises again."
+    "An alarm is named by what began it: another fault that came while it stood, or soon after, has an alarm of its own "
+    "where it is more than what errors of the model leave of the first (a seventh of its effect); a smaller one may "
+    "have no name here. Its time is where the statistic of the output rises again."
 )
 
 #: Rows in alarm without a fault that fits after which an alarm is shelved: the oldest change that is looked for.
@@ -65,13 +66,17 @@ REASONS = {
     NO_DECISION: "the window of the monitor was not full, or a warm-up or a gap was not over",
 }
 
+#: At which evidence an alarm without a name was named: whether beside another, and how much.
+NOT_NAMED = (False, -math.inf)
+
 #: Alarms that a summary lists.
 MOST_LISTED_ALARMS = 20
 
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """An alarm: rows above a threshold that are less than 20 rows apart, rows that are missing among them.
+    """An alarm: rows above a threshold that are less than 20 rows apart, rows that are missing among them; where
+    sensors and faults are ranked, it ends where another change begins to be named.
 
     Parameters
     ----------
@@ -164,7 +169,8 @@ class AlarmLog:
     def __init__(self, columns: Sequence[str]) -> None:
         self._places = {name: i for i, name in enumerate(columns)}
         self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
-        self._named_by = dict[str, float]()  # the evidence at which the fault of an open event was named
+        self._named_by = dict[str, tuple[bool, float]]()  # at which evidence the fault of an open event was named
+        self._earlier = dict[str, int]()  # how many changes that were named came before an open event
         self._place, self._places_of = 0, dict[str, int]()  # of this row, and of the last row of an open event
         self._unexplained = dict[str, tuple[int, float]]()  # place and time since when no fault explains an open event
         self.silent = Counter[str]()
@@ -190,25 +196,31 @@ class AlarmLog:
         fault would be named if there was one; ``ranking``: what it may be; ``beyond``: inputs that are
         beyond what was learned."""
         before = self._open.get(by)
-        if before is not None and self._place - self._places_of[by] > HOLD:
+        earlier = 0 if ranking is None else ranking.earlier
+        is_another = before is not None and earlier > self._earlier[by]
+        if before is not None and (is_another or self._place - self._places_of[by] > HOLD):
             self._closed.append(self._open.pop(by))
             before = None
         if before is None:
-            self._named_by[by] = -math.inf
+            self._named_by[by] = NOT_NAMED
             self._unexplained.pop(by, None)
+            self._earlier[by] = earlier
         self._places_of[by] = self._place
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
-        earlier = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
+        size_before = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault
-        tells = before is None or (distinguished and not evidence <= self._named_by[by])
+        # The statistic is that of all changes together: what came later is named where it is itself the largest.
+        is_later = ranking is not None and not math.isnan(ranking.ratio)
+        naming = (is_later, ranking.ratio if ranking is not None and is_later else evidence)
+        tells = before is None or (distinguished and earlier == self._earlier[by] and not naming <= self._named_by[by])
         shelved = self._shelved(by, fault, time)
         # What explains an alarm that was shelved is reported, whatever it was called at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
-        size, low, high = self._size(fault, cells, ranking) if tells else earlier
+        size, low, high = self._size(fault, cells, ranking) if tells else size_before
         if tells:
             named = fault
-            self._named_by[by] = evidence if distinguished else -math.inf
+            self._named_by[by] = naming if distinguished else NOT_NAMED
         self._open[by] = AlarmEvent(
             by=by,
             fault=named,

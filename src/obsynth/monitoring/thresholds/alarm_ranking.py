@@ -12,7 +12,8 @@ NONE_OF_THESE, SENSOR = "none of these faults", "sensor "
 
 class Ranking(NamedTuple):
     """What an alarm may be, the most likely first: names and posterior shares; the one that it is called by, and those
-    that are as likely; whether that one drifts, and for a sensor how far off it is, with its deviation."""
+    that are as likely; whether that one drifts, and for a sensor how far off it is, with its deviation; how many other
+    changes came before it, and twice its log likelihood ratio where the effects of these are subtracted."""
 
     shares: tuple[tuple[str, float], ...]
     named: str
@@ -20,6 +21,8 @@ class Ranking(NamedTuple):
     drifts: bool = False
     size: float = math.nan
     deviation: float = math.nan
+    earlier: int = 0
+    ratio: float = math.nan
 
     @property
     def is_sensor(self) -> bool:

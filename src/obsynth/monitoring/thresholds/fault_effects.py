@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from obsynth.methods.registry import error_model
-from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of
+from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
+from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR, EarlierChanges
+from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of, ranked
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_profiles
 from obsynth.monitoring.thresholds.learned_levels import HOLD
@@ -47,9 +49,6 @@ HELD = 12
 #: Rows after a begin that count: what is further away says more of the model than of the change.
 COUNTED = FOLLOWED * 2**MOST_DOUBLINGS
 
-#: Rows of an alarm in which its likeliest begins are looked for; after that they stay, as long as it lasts.
-LOOKED_FOR = 20
-
 #: Numbers that are followed in each row at most, a hundredth of a second: of larger designs nothing is ranked.
 MOST_NUMBERS = 2_000_000
 
@@ -71,6 +70,7 @@ class EffectState(NamedTuple):
     row: float = 0.0  # of the last sample
     alarmed: float = 0.0  # alarmed, quiet: rows of an alarm, and rows since the last one of it
     quiet: float = 0.0
+    earlier: EarlierChanges = EarlierChanges()  # changes that were named, and are subtracted from what came later
 
 
 _NOTHING = read_only(np.zeros(0))
@@ -105,6 +105,7 @@ class FaultEffects(ABC):
         return EffectState(
             np.full(b, np.nan), np.zeros(b), np.zeros((b, n, h)), np.zeros((b, order, m, h)), np.zeros((b, h)),
             np.zeros((b, h)), np.zeros((b, m)), np.zeros(b), np.zeros(b),
+            earlier=EarlierChanges.none(b, m, h),
         )  # fmt: skip
 
     def step(
@@ -114,21 +115,26 @@ class FaultEffects(ABC):
         of which those that were ``seen (m,)`` are measured, or none (`None`)."""
         if isinstance(observation, DAERow) and observation.k == 0:
             return self.init()
-        state = self._with_begin(state)
+        state = self._with_begin(self._ended(state) if state.quiet == HOLD else state)
         followed = np.isfinite(state.begun)
         rows = np.where(followed, state.row - state.begun + 1.0, 0.0)
         with np.errstate(all="ignore"):
             error, past, added = self._moved(state, observation, rows, seen)
             error = error * followed[:, None, None]
             score, information, sums, count = state.score, state.information, state.sums, state.counts
+            earlier = state.earlier
             if counts and seen is not None:
                 counted = followed & (rows <= COUNTED)
+                earlier = earlier.moved(added, counted, white)
                 added = added * counted[:, None, None]
                 score = score + np.einsum("bmh,m->bh", added, white)
                 information = information + np.einsum("bmh,bmh->bh", added, added)
                 sums, count = sums + counted[:, None] * white, count + counted
-        after = state._replace(error=error, past=past, score=score, information=information, sums=sums, counts=count)
-        return after if all(np.isfinite(part).all() for part in after[2:8]) else self.init()
+        after = state._replace(
+            error=error, past=past, score=score, information=information, sums=sums, counts=count, earlier=earlier
+        )
+        finite = all(np.isfinite(part).all() for part in (*after[2:8], *earlier[2:6]))
+        return after if finite else self.init()
 
     @abstractmethod
     def _moved(
@@ -141,6 +147,17 @@ class FaultEffects(ABC):
     def _at_begin(self, error: FloatArray) -> None:
         """Write the errors ``(n, h)`` with which hypotheses begin."""
 
+    def _ended(self, state: EffectState) -> EffectState:
+        """Return the state after an alarm that was too short for what it was named by to be kept: it is now."""
+        earlier = state.earlier
+        if not earlier.number and state.alarmed > 0.0:
+            _, ranking, best = self._beside_none(state._replace(alarmed=float(LOOKED_FOR)))
+            return self._keeping(state, ranking, best)
+        if earlier.looked:
+            looked = earlier._replace(looked=LOOKED_FOR)
+            return self._beside_earlier(state._replace(earlier=looked), None)[0]
+        return state
+
     def _with_begin(self, state: EffectState) -> EffectState:
         """Return the state with one more begin, in the place of one that is followed no longer."""
         row, quiet = state.row + 1.0, state.quiet + 1.0
@@ -150,21 +167,87 @@ class FaultEffects(ABC):
         for part in (error, past, score, information, sums, counts, held):
             part[place] = 0.0
         self._at_begin(error[place])
+        earlier = state.earlier
         if quiet > HOLD:
             held[:] = 0.0
+            earlier = earlier._replace(looked=0, is_over=1)
+            # What began before they were named is followed no longer.
+            if row - earlier.since > COUNTED:
+                earlier = earlier._replace(count=0, number=0)
+            held[earlier.begins] = 1.0
         begun[place], until[place] = row, row + FOLLOWED * 2.0 ** _doublings(int(row))
         alarmed = state.alarmed if quiet <= HOLD else 0.0
-        return EffectState(begun, until, error, past, score, information, sums, counts, held, row, alarmed, quiet)
+        return EffectState(
+            begun, until, error, past, score, information, sums, counts, held, row, alarmed, quiet,
+            earlier.with_begin(place),
+        )  # fmt: skip
 
-    def explained(self, state: EffectState) -> tuple[EffectState, Explanation]:
-        """Return what the hypotheses explain of the rows up to one in alarm, and the state that keeps their begins."""
+    def explained(self, state: EffectState) -> tuple[EffectState, Ranking | None]:
+        """Return what the rows up to one in alarm may be, and the state that keeps the begins of the likeliest: what
+        came last, where it is more than the changes that were named before."""
+        state, ranking, best = self._beside_none(state)
+        if state.earlier.number:
+            return self._beside_earlier(state, ranking)
+        if state.alarmed >= LOOKED_FOR:
+            state = self._keeping(state, ranking, best)
+        return state, ranking
+
+    def _beside_none(self, state: EffectState) -> tuple[EffectState, Ranking | None, NDArray[np.intp]]:
+        """Return what rows in alarm may be if there is one change alone, and where that began ``(h,)``."""
         parts, is_held = (state.score, state.information, state.sums, state.counts), state.held > 0.0
         if state.alarmed >= LOOKED_FOR and is_held.any():
-            return state._replace(quiet=0.0), _explanation(*(part[is_held] for part in parts))[0]
+            explanation, best = _explanation(*(part[is_held] for part in parts))
+            best = np.flatnonzero(is_held)[best]
+            return state._replace(quiet=0.0), ranked(self.hypotheses, explanation), best
         explanation, best = _explanation(*parts)
         held = np.zeros_like(state.held)
-        held[best[np.argsort(-explanation.ratios)[:HELD]]] = 1.0
-        return state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0), explanation
+        held[state.earlier.begins] = 1.0
+        held[best[np.argsort(-explanation.ratios)[: HELD - state.earlier.count]]] = 1.0
+        state = state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0)
+        return state, ranked(self.hypotheses, explanation), best
+
+    def _beside_earlier(self, state: EffectState, alone: Ranking | None) -> tuple[EffectState, Ranking | None]:
+        """Return what came after the changes that were named, where it is something else; else what it is ``alone``."""
+        earlier, later = state.earlier, state.begun > state.earlier.since
+        # A new alarm is one of its own, whatever it is called.
+        alone = alone._replace(earlier=earlier.number) if alone is not None and earlier.is_over else alone
+        if not later.any():
+            return state, alone
+        parts = *earlier.beside(state.score, state.information, state.sums), state.counts
+        explanation, best = _explanation(*(part[later] for part in parts))
+        ranking, ratio = ranked(self.hypotheses, explanation), float(explanation.ratios.max())
+        names = {self.hypotheses[int(i)].name for i in earlier.hypotheses[: earlier.count]}
+        if ranking is None or not earlier.distinguishes(ranking, ratio, names):
+            return state, alone
+        ranking = ranking._replace(earlier=earlier.number, ratio=ratio)
+        state = state._replace(earlier=earlier._replace(looked=earlier.looked + 1))
+        best = np.flatnonzero(later)[best]
+        # Begins of what is looked for now are followed, in place of those that an alarm is not named by.
+        held = np.zeros_like(state.held)
+        held[earlier.begins] = 1.0
+        held[best[np.argsort(-explanation.ratios)[: HELD - earlier.count]]] = 1.0
+        state = state._replace(held=held)
+        if state.earlier.looked >= LOOKED_FOR:
+            state = self._keeping(state, ranking, best)
+        return state, ranking
+
+    def _keeping(self, state: EffectState, ranking: Ranking | None, best: NDArray[np.intp]) -> EffectState:
+        """Return the state in which the effect of what an alarm is named by, which began at ``best (h,)``, is
+        subtracted from what comes later."""
+        if ranking is None:
+            return state
+        earlier = state.earlier.kept(state.row)
+        if ranking.named == NONE_OF_THESE:
+            return state._replace(earlier=earlier)
+        number = next(
+            i
+            for i, hypothesis in enumerate(self.hypotheses)
+            if hypothesis.name == ranking.named and hypothesis.is_drift == ranking.drifts
+        )
+        place, held = int(best[number]), state.held.copy()
+        held[place] = 1.0
+        score, information = float(state.score[place, number]), float(state.information[place, number])
+        return state._replace(earlier=earlier.with_change(place, number, score, information), held=held)
 
 
 class FilterEffects(FaultEffects):
@@ -230,7 +313,10 @@ class LinearEffects(FaultEffects):
     def _moved(
         self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return state.error, state.past, self.responses[np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)]
+        places = np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)
+        # Later on a jump has settled, and a drift goes on as it went.
+        slope = self.responses[-1] - self.responses[-2]
+        return state.error, state.past, self.responses[places] + np.maximum(rows - COUNTED, 0.0)[:, None, None] * slope
 
     @cached_property
     def responses(self) -> FloatArray:

@@ -70,7 +70,7 @@ def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Rankin
     for i, hypothesis in enumerate(hypotheses):
         ratio, before = explanation.ratios[i], best.get(hypothesis.name)
         # A jump is what is usual: a drift is told where it explains clearly more.
-        if before is None or ratio > explanation.ratios[before] + DISTINGUISHED * _scale(ratio):
+        if before is None or ratio > explanation.ratios[before] + DISTINGUISHED * ratio_scale(ratio):
             best[hypothesis.name] = i
             (drifts.add if hypothesis.is_drift else drifts.discard)(hypothesis.name)
     ratios = {name: float(explanation.ratios[i]) for name, i in best.items()}
@@ -107,7 +107,7 @@ def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, f
     """Return posterior shares by what hypotheses explain, the largest first; and those that are as likely as the best,
     faults of the plant first."""
     most = max(ratios.values())
-    scale = _scale(most)
+    scale = ratio_scale(most)
     weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
     total = sum(weights.values())
     shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda hypothesis: -hypothesis[1])
@@ -116,6 +116,6 @@ def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, f
     return tuple(shares), near
 
 
-def _scale(ratio: float) -> float:
+def ratio_scale(ratio: float) -> float:
     """Return by how much differences of ratios count less, as effects are those of a model that is not exact."""
     return max(1.0, MODEL_SHARE * ratio / DISTINGUISHED)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
-from obsynth.monitoring.thresholds.hypotheses import ranked, ranked_changes
+from obsynth.monitoring.thresholds.hypotheses import ranked_changes
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
@@ -193,8 +193,8 @@ class LearnedRule(Rule):
         )
         ranking = None
         if self.effects is not None and values.max() > 1.0:
-            effects, explained = self.effects.explained(state.effects)
-            state, ranking = state._replace(effects=effects), ranked(self.effects.hypotheses, explained)
+            effects, ranking = self.effects.explained(state.effects)
+            state = state._replace(effects=effects)
             if ranking is None and self._walk is not None:
                 by_fault = values[-2 * len(self._faults) :].reshape(2, -1)
                 ranking = ranked_changes(self._names, self._changes(state, 0.0), by_fault.max(axis=0) > 1.0)

@@ -329,9 +329,10 @@ class Monitor:
             return after, MonitorOutput(statistic, threshold, False, "", more)
         if number is None and self.fault_names and np.isfinite(sample.faults).all():
             number = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
-        # Between faults of the plant the rule decides where it can; sensors, and none of these, are ranked beside them.
+        # Between faults of the plant the rule decides where it can; sensors, and none of these, are ranked beside them,
+        # and so is what came after another change.
         decided = number is not None and number != NOT_DISTINGUISHED
-        of_plant = ranking is None or (decided and ranking.named in self.fault_names)
+        of_plant = ranking is None or (decided and math.isnan(ranking.ratio) and ranking.named in self.fault_names)
         fault = self._named(number) if of_plant or ranking is None else ranking.called(self.fault_names)
         return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
