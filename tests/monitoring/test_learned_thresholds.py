@@ -306,6 +306,51 @@ def test_blank_cells_add_no_evidence_and_take_none_away() -> None:
     assert run.table.statistic.notna().sum() >= 580
 
 
+def test_a_signal_that_follows_from_the_rows_before_rests_on_them() -> None:
+    rng = np.random.default_rng(3)
+    r, estimate = rng.standard_normal(1_000), np.zeros(1_000)
+    for k in range(1, len(r)):
+        estimate[k] = 0.98 * estimate[k - 1] + 0.5 * r[k - 1]
+    assert fitted_autoregression(np.column_stack([estimate, r])).rests_on_the_past
+    noisy = estimate + 0.5 * rng.standard_normal(1_000)
+    assert not fitted_autoregression(np.column_stack([noisy, r])).rests_on_the_past
+    assert not fitted_autoregression(r[:, None], order=0).rests_on_the_past
+    # Eight rows of a constant 0.9 leave 0.19 of the variance new: what it decays to is summed to its end.
+    assert not Autoregression(np.zeros(1), np.full((1, 1, 1), 0.9), np.eye(1)).rests_on_the_past
+    assert Autoregression(np.zeros(1), np.full((1, 1, 1), 0.997), np.eye(1)).rests_on_the_past
+
+
+@pytest.mark.long
+def test_what_follows_exactly_from_the_rows_before_is_no_evidence_behind_a_missing_one() -> None:
+    """A blank cell was an alarm for 204 rows, 1e18 times the level: the estimate of a PI observer follows from the
+    residuals before to all digits, and the row before was not known."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.05, 0.8]], B=[[1.0], [0.5]], C=np.eye(2), Bf=[[1], [0]], dt=1.0,
+        sensor_noise={"y1": 0.05, "y2": 0.05},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant)
+
+    def of_plant(rows: int, seed: int, fault: float = 0.0) -> pd.DataFrame:
+        rng, x, found = np.random.default_rng(seed), np.zeros(2), []
+        for k in range(rows):
+            u = float(np.sign(np.sin(0.1 * k)))
+            found.append([k, u, *(x + 0.05 * rng.standard_normal(2))])
+            x = plant.A @ x + np.array([1.0, 0.5]) * u + 0.002 * rng.standard_normal(2)
+            x[0] += fault * (k >= 350)
+        return pd.DataFrame(found, columns=["time", "u1", "y1", "y2"])
+
+    found = obsynth.learn_thresholds(design, [of_plant(1_000, 1), of_plant(1_000, 2)])
+    assert "fhat[f1]" in found.columns
+    monitor = obsynth.online_monitor(design, "learned", normal=found)
+    blank, gap, fault = of_plant(600, 3), of_plant(600, 4).drop(index=range(300, 312)), of_plant(600, 5, 0.05)
+    blank.loc[300:303, "y2"] = np.nan
+    for log_with_flaws in (blank, gap):
+        assert not obsynth.run_on_data(design, log_with_flaws, monitor=monitor).alarms
+    fault.loc[340, "y1"] = np.nan
+    run = obsynth.run_on_data(design, fault, monitor=monitor)
+    assert 350.0 <= run.alarms["learned"] <= 365.0
+
+
 def test_runs_go_on_from_a_saved_state(tmp_path: Path) -> None:
     monitor, data, state = obsynth.online_monitor(heated(), "learned", normal=learned()), log(300, 2), tmp_path / "s"
     whole = obsynth.run_on_data(heated(), data, monitor=monitor).table

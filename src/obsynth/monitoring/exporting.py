@@ -143,6 +143,7 @@ class LearnedMonitorInC:
             "MONITOR_INPUTS": 0 if learned.ranges is None else len(learned.ranges.middle_and_half()[0]),
             "MONITOR_STATISTICS": len(learned.levels),
             "MONITOR_HOLD": HOLD,
+            "MONITOR_RESTS": int(model.rests_on_the_past),
             "MONITOR_OWN": OWN_ROWS[0],
             "MONITOR_OWN_LATER": OWN_ROWS[1],
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),

@@ -27,6 +27,9 @@ REGRESSOR_SHARE = 1e-10
 #: autoregression says (gains that change with inputs), and a single row of it is worth hundreds of deviations.
 LEAST_OWN = 0.01
 
+#: Doublings after which the slowest fit (`SLOWEST_FIT`) has decayed to nothing.
+DOUBLINGS = 20
+
 #: Least variance of a direction of what is new, in a mean of one: below it, what signals that depend on each other
 #: leave is how they do, and not noise.
 LEAST_NEW = 1e-3
@@ -65,6 +68,22 @@ class Autoregression:
         """Whether what is new of each signal is new beside the others: none nearly follows from them and the past."""
         precision = self.whitener.T @ self.whitener
         return bool((np.diag(precision) * np.diag(np.linalg.inv(precision)) < 1.0 / LEAST_OWN).all())
+
+    @cached_property
+    def rests_on_the_past(self) -> bool:
+        """Whether a signal is predicted to a tenth of its deviation: behind a row that is missing the prediction is off
+        by many times what it is otherwise, as of an estimate that follows exactly from the residuals before."""
+        p, m = self.order, self.channels
+        if not p:
+            return False
+        companion = np.vstack([np.hstack(list(self.A)), np.eye((p - 1) * m, p * m)])
+        new = np.zeros_like(companion)
+        new[:m, :m] = np.linalg.inv(self.whitener.T @ self.whitener)
+        # Doubling: after k steps the sum has 2^k terms, and what decays slowest has decayed after 2^20.
+        variance, power = new, companion
+        for _ in range(DOUBLINGS):
+            variance, power = variance + power @ variance @ power.T, power @ power
+        return bool((np.diag(new)[:m] < LEAST_OWN * np.diag(variance)[:m]).any())
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Return e of rows ``(..., n, m)``: zero in the first p of them, NaN where a row that is needed is NaN."""

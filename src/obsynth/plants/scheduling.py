@@ -428,11 +428,12 @@ def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Calla
             return forms[0] if forms[1].constant else LinearForm(Fraction(1))
         if operation is np.multiply:
             return _product(forms[0], forms[1], expanded=expanded)
-        if operation is np.power and not forms[1].parts and forms[1].constant in SMALL_POWERS and forms[0].monomial:
-            factor, text = forms[0].monomial
+        monomials = [form.monomial for form in forms]
+        if operation is np.power and monomials[0] and not forms[1].parts and forms[1].constant in SMALL_POWERS:
+            factor, text_of_base = monomials[0]
             times = int(forms[1].constant)
-            return LinearForm(Fraction(0), {_text_of_factors(_factors(text) * times): factor**times})
-        if operation is np.divide and (forms[0].monomial or forms[1].monomial):
+            return LinearForm(Fraction(0), {_text_of_factors(_factors(text_of_base) * times): factor**times})
+        if operation is np.divide and any(monomials):
             (above, x), (below, y) = (form.monomial or (Fraction(1), form.text) for form in forms)
             return LinearForm(Fraction(0), {TEXTS_OF_OPERATIONS[operation](x, y): above / below})
         text = (

@@ -34,9 +34,9 @@ NOT_VALID = (
 
 #: What is said of names where an alarm lasted for longer than changes are looked for.
 NAMED_BY_THE_FIRST = (
-    "An alarm is named by what began it: another fault that came while it stood, or soon after, has an alarm of its own "
-    "where it is more than what errors of the model leave of the first (a seventh of its effect); a smaller one may "
-    "have no name here. Its time is where the statistic of the output rises again."
+    "An alarm is named by what began it: another fault that came while it stood, or soon after, has an alarm of its "
+    "own where it is more than what errors of the model leave of the first (a seventh of its effect); a smaller one "
+    "may have no name here. Its time is where the statistic of the output rises again."
 )
 
 #: Rows in alarm without a fault that fits after which an alarm is shelved: the oldest change that is looked for.

@@ -479,7 +479,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
      * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. In
      * that row itself the innovations that are there are what they always are. */
     if (m->to_wait > 0) {
-        most = innovation / monitor_innovation[0][0];
+        most = innovation < 0 ? 0 : innovation / monitor_innovation[0][0];
     }
     if (!is_whole && innovation >= 0) {
         m->to_wait = ORDER + 1;
@@ -487,6 +487,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     m->to_wait -= m->to_wait > 0;
     /* What follows a warm-up is predicted from its last rows. */
     is_said = is_whole || ((innovation >= 0 || !m->decided) && (is_said || known));
+    /* Rows that are predicted from a missing one add no evidence where a column is predicted closely. */
+    if (MONITOR_RESTS && !is_said && innovation < 0) {
+        m->to_wait = ORDER;
+    }
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
     if (deciding && m->taken > MONITOR_SETTLING) {

@@ -93,12 +93,8 @@ class EarlierChanges(NamedTuple):
 
     def kept(self, row: float) -> EarlierChanges:
         """Return the state in which what begins after a ``row`` is judged beside what is there."""
-        parts = (
-            (self.score, self.information, self.shared, self.sums)
-            if self.number
-            else map(np.zeros_like, (self.score, self.information, self.shared, self.sums))
-        )
-        score, information, shared, sums = parts
+        before = (self.score, self.information, self.shared, self.sums)
+        score, information, shared, sums = before if self.number else (np.zeros_like(part) for part in before)
         return self._replace(
             score=score, information=information, shared=shared, sums=sums, number=self.number + 1, since=row,
             looked=0, is_over=0,

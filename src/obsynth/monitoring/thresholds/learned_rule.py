@@ -86,6 +86,9 @@ class LearnedRule(Rule):
     ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
     likely.
 
+    Of a linear observer with a column that is predicted closely, as an estimate that follows from the residuals before,
+    rows that are predicted from a missing one add no evidence, as none of these was learned from.
+
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  An alarm that stands
     after the first `OWN_ROWS` rows of a run ends there: their means take the place of what the one log had."""
@@ -110,6 +113,7 @@ class LearnedRule(Rule):
         templates = learned.statistics.templates()
         self._templates = templates.reshape(len(templates) * len(AGES), -1)
         self._model = learned.statistics.model
+        self._rests_on_the_past = self._model.rests_on_the_past
         offsets = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
         self._effects = offsets.ravel()
         bands = learned.statistics.fault_bands
@@ -139,6 +143,8 @@ class LearnedRule(Rule):
         missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
         for _ in range(min(max(missing, 0), max(AGES))):
             state = self._added(state, None)
+        if missing > 0 and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
+            state = state._replace(waiting=self._model.order)
         state = state._replace(last=sample.time, taken=state.taken + 1, decided=int(state.decided or sample.deciding))
         state = self._scored(state, sample.observation, max(missing, 0))
         if sample.deciding and state.taken > self.learned.settling:
@@ -155,6 +161,8 @@ class LearnedRule(Rule):
         most, varying = math.inf if counts else 0.0, isinstance(sample.observation, Evidence)
         if counts and state.waiting and isinstance(sample.observation, Evidence):
             most = float(np.linalg.norm(sample.observation.whitened)) / self.learned.innovation
+        elif state.waiting and not varying:
+            most = 0.0
         if not complete and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
@@ -164,11 +172,15 @@ class LearnedRule(Rule):
             complete or (kept and (counts or np.isfinite(values_of_row[self._places]).all()))
         ):
             state = self._followed(self._added(state, None), sample.observation)
+            if self._rests_on_the_past and not varying:
+                state = state._replace(waiting=self._model.order)
         else:
             watched = values_of_row[self._places]
             filled = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
             seen = np.isfinite(watched) if complete or varying else None
-            state = self._followed(self._added(state, filled, most, evidence), sample.observation, seen, counts=counts)
+            state = self._followed(
+                self._added(state, filled, most, evidence), sample.observation, seen, counts=counts and most > 0.0
+            )
         # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
         # stands is not ended by outputs that are left out.
         by_rows_before = varying and sample.deciding and state.taken > self.learned.settling
