@@ -79,9 +79,9 @@ def test_begins_that_take_the_place_of_others_share_nothing_and_no_more_are_kept
     assert again.shared[1].any()
     for place in range(1, 5):
         changes = changes.kept(20.0).with_change(place % BEGINS, 0, 1.0, 2.0)
-    assert changes.count == MOST_KEPT
+    assert changes.changes == MOST_KEPT
     assert changes.number == 5
-    fresh = changes._replace(number=0, count=0).kept(30.0)
+    fresh = changes._replace(number=0, changes=0).kept(30.0)
     assert not fresh.information.any()
 
 

@@ -46,7 +46,7 @@ class EarlierChanges(NamedTuple):
     information: FloatArray = _NOTHING  # ``(r, r)``
     shared: FloatArray = _NOTHING  # ``(b, h, r)``: products of effects on white rows
     sums: FloatArray = _NOTHING  # ``(b, m, r)``: sums of their effects
-    count: int = 0  # of changes
+    changes: int = 0  # how many there are
     number: int = 0  # of these, and of alarms that no change explains
     since: float = 0.0  # the row in which the last of them was kept: what began later is judged beside them
     looked: int = 0  # rows in which something that began later has been the likeliest
@@ -64,7 +64,7 @@ class EarlierChanges(NamedTuple):
     @property
     def begins(self) -> NDArray[np.intp]:
         """The places of the begins of the changes."""
-        return self.places[: self.count].astype(np.intp)
+        return self.places[: self.changes].astype(np.intp)
 
     def with_begin(self, place: int) -> EarlierChanges:
         """Return the state in which a begin is followed in the ``place`` of another one."""
@@ -82,7 +82,7 @@ class EarlierChanges(NamedTuple):
         m = len(white)
         own = np.zeros((m, m + MOST_KEPT))
         own[:, :m] = np.eye(m)
-        own[:, m : m + self.count] = added[self.begins, :, self.hypotheses[: self.count].astype(np.intp)].T
+        own[:, m : m + self.changes] = added[self.begins, :, self.hypotheses[: self.changes].astype(np.intp)].T
         of_begins = added * counted[:, None, None]
         return self._replace(
             score=self.score + own.T @ white,
@@ -102,7 +102,7 @@ class EarlierChanges(NamedTuple):
 
     def with_change(self, place: int, hypothesis: int, score: float, information: float) -> EarlierChanges:
         """Return the state with one more change, of so much score and information; with no more than `MOST_KEPT`."""
-        n = self.count
+        n = self.changes
         if n == MOST_KEPT:
             return self
         places, hypotheses, scores, informations = map(
@@ -112,13 +112,15 @@ class EarlierChanges(NamedTuple):
         places[n], hypotheses[n], scores[last] = place, hypothesis, score
         informations[last, :last] = informations[:last, last] = self.shared[place, hypothesis, :last]
         informations[last, last] = information
-        return self._replace(places=places, hypotheses=hypotheses, score=scores, information=informations, count=n + 1)
+        return self._replace(
+            places=places, hypotheses=hypotheses, score=scores, information=informations, changes=n + 1
+        )
 
     def beside(
         self, score: FloatArray, information: FloatArray, sums: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return score and information ``(b, h)``, and sums of white rows ``(b, m)``, that are left beside them."""
-        n = len(self.score) - MOST_KEPT + self.count
+        n = len(self.score) - MOST_KEPT + self.changes
         inverse = np.linalg.pinv(self.information[:n, :n], hermitian=True)
         sizes, shared = inverse @ self.score[:n], self.shared[..., :n]
         left = information - np.einsum("bhr,rs,bhs->bh", shared, inverse, shared)

@@ -173,7 +173,7 @@ class FaultEffects(ABC):
             earlier = earlier._replace(looked=0, is_over=1)
             # What began before they were named is followed no longer.
             if row - earlier.since > COUNTED:
-                earlier = earlier._replace(count=0, number=0)
+                earlier = earlier._replace(changes=0, number=0)
             held[earlier.begins] = 1.0
         begun[place], until[place] = row, row + FOLLOWED * 2.0 ** _doublings(int(row))
         alarmed = state.alarmed if quiet <= HOLD else 0.0
@@ -202,7 +202,7 @@ class FaultEffects(ABC):
         explanation, best = _explanation(*parts)
         held = np.zeros_like(state.held)
         held[state.earlier.begins] = 1.0
-        held[best[np.argsort(-explanation.ratios)[: HELD - state.earlier.count]]] = 1.0
+        held[best[np.argsort(-explanation.ratios)[: HELD - state.earlier.changes]]] = 1.0
         state = state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0)
         return state, ranked(self.hypotheses, explanation), best
 
@@ -216,7 +216,7 @@ class FaultEffects(ABC):
         parts = *earlier.beside(state.score, state.information, state.sums), state.counts
         explanation, best = _explanation(*(part[later] for part in parts))
         ranking, ratio = ranked(self.hypotheses, explanation), float(explanation.ratios.max())
-        names = {self.hypotheses[int(i)].name for i in earlier.hypotheses[: earlier.count]}
+        names = {self.hypotheses[int(i)].name for i in earlier.hypotheses[: earlier.changes]}
         if ranking is None or not earlier.distinguishes(ranking, ratio, names):
             return state, alone
         ranking = ranking._replace(earlier=earlier.number, ratio=ratio)
@@ -225,7 +225,7 @@ class FaultEffects(ABC):
         # Begins of what is looked for now are followed, in place of those that an alarm is not named by.
         held = np.zeros_like(state.held)
         held[earlier.begins] = 1.0
-        held[best[np.argsort(-explanation.ratios)[: HELD - earlier.count]]] = 1.0
+        held[best[np.argsort(-explanation.ratios)[: HELD - earlier.changes]]] = 1.0
         state = state._replace(held=held)
         if state.earlier.looked >= LOOKED_FOR:
             state = self._keeping(state, ranking, best)
