@@ -93,7 +93,7 @@ def test_what_errors_of_the_model_leave_is_no_change() -> None:
     assert not changes.distinguishes(later, 20.0, {"leak"})
     assert not changes.distinguishes(later._replace(named="worn", ties=("leak",)), 20.0, {"leak"})
     assert not changes.distinguishes(later._replace(named=NONE_OF_THESE), 20.0, {"worn"})
-    strong = changes._replace(score=30.0 * changes.score)
+    strong = changes._replace(score=300.0 * changes.score)
     assert not strong.distinguishes(later, 0.015 * strong.ratio, {"worn"})
     assert strong.distinguishes(later, 0.025 * strong.ratio, {"worn"})
 

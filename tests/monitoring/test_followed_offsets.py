@@ -98,3 +98,7 @@ def test_an_offset_from_the_first_row_on_ends_and_a_jump_soon_after_the_start_do
     jump.loc[150:, "y"] += 4.0 * NOISE
     later = obsynth.run_on_data(pumped(), jump, monitor=monitor)
     assert later.table["alarm"].ne("").to_numpy()[150:].mean() > 0.5
+    # It stood at the second count of rows, and not at the first.
+    assert any("when 200 rows had been decided" in text for text in later.warnings)
+    quiet = obsynth.run_on_data(pumped(), log(6), monitor=monitor)
+    assert not any("taken for what is usual" in text for text in quiet.warnings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -374,6 +375,21 @@ def test_row_by_row_is_the_same_as_at_once() -> None:
         state, judged = rule.step(state, Sample(k * DT, nothing, nothing, LinearSample(row, nothing, nothing, 0)))
         taken.append(judged.statistic)
     np.testing.assert_allclose(taken[max(AGES) :], largest[model.order + max(AGES) :], rtol=1e-9)
+
+
+def test_rows_of_a_warm_up_are_what_the_next_are_predicted_from() -> None:
+    found = learned()
+    count, channels = len(watched_names(heated())), found.statistics.model.channels
+    model = Autoregression(np.zeros(channels), 0.9 * np.eye(channels)[None], np.eye(channels))
+    assert not model.rests_on_the_past
+    rule = LearnedRule(replace(found, statistics=replace(found.statistics, model=model)), watched_names(heated()))
+    nothing, state, statistics = np.zeros(0), rule.init(), []
+    for k in range(60):
+        observation = LinearSample(np.full(count, 5.0 * 0.9 ** (k - 40)), nothing, nothing, 0)
+        state, judged = rule.step(state, Sample(k * DT, nothing, nothing, observation, deciding=k >= 40))
+        statistics.append(judged.statistic)
+    assert np.isnan(statistics[:40]).all()
+    assert max(statistics[40:]) < 1e-9
 
 
 @pytest.mark.long
