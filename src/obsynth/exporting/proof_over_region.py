@@ -329,9 +329,13 @@ class RegionProof:
             witnesses, stated = self._at_all_pairs(matrices or [], form), self._of_matrices(matrices or [])
             if witnesses is not None and stated is not None:
                 found = {
-                    "claim": "gain over the region", "signal": signal, "rows": [kind],
-                    "gamma": number_data(gamma), **stated, "bounded_real": witnesses,
-                }  # fmt: skip
+                    "claim": "gain over the region",
+                    "signal": signal,
+                    "rows": [kind],
+                    "gamma": number_data(gamma),
+                    **stated,
+                    "bounded_real": witnesses,
+                }
                 break
         slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
         self._add(f"the l2 gain {claims[name]:.6g} from the {signal}{slow}", found)
@@ -358,9 +362,12 @@ class RegionProof:
             level = max(root_above(largest), claims["region_deviation"])
             if level <= claims["region_deviation"] * NORM_ROOM[-1]:
                 found = {
-                    "claim": "mean square over the region", "rows": ["state"], "level": number_data(level),
-                    **stated, "decreases": witnesses,
-                }  # fmt: skip
+                    "claim": "mean square over the region",
+                    "rows": ["state"],
+                    "level": number_data(level),
+                    **stated,
+                    "decreases": witnesses,
+                }
         slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
         self._add(f"the mean square of the errors{slow}", found)
 

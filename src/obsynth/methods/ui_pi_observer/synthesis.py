@@ -257,8 +257,9 @@ def _chosen(
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, method)
         runs = (record,)
     elif method.decay is not None:
-        # What the user says of the drive is not ours to change.
-        drives = DRIVES if weights.keys().isdisjoint(("process", "fault")) else DRIVES[:1]
+        # What the user says of the drive is not ours to change; without a rate nothing else makes errors decay.
+        own = method.decay > 0.0 and weights.keys().isdisjoint(("process", "fault"))
+        drives = DRIVES if own else DRIVES[:1]
         gain = _for_decay(problem, kalman, method.decay, method.objective, dt, drives=drives)
     elif (fair := compromise(kalman, problem.rate)) is not None:
         gain, claims = fair[0], {"noise_price": fair[2]}

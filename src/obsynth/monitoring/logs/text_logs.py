@@ -59,6 +59,8 @@ BINARY = (
 
 #: Characters below the space that a text may have.
 CONTROLS_IN_TEXTS = frozenset("\t\n\v\f\r\x1a")
+#: Characters by which the letters of a text are judged, at least: a file that ends within a character has one.
+FEWEST_JUDGED = 16
 
 
 def number_in_cell(
@@ -133,7 +135,7 @@ def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
 def _is_binary(error: UnicodeDecodeError) -> bool:
     """Whether bytes are no text with a flaw: they have characters that no text has, or hardly any of a table."""
     text = error.object.decode(error.encoding, "replace")
-    return _has_controls(text) or 2 * sum(map(str.isascii, text)) < len(text)
+    return _has_controls(text) or (len(text) >= FEWEST_JUDGED and 2 * sum(map(str.isascii, text)) < len(text))
 
 
 def _has_controls(text: str) -> bool:

@@ -57,9 +57,13 @@ class EarlierChanges(NamedTuple):
         """Return the state without any."""
         r = channels + MOST_KEPT
         return cls(
-            np.zeros(MOST_KEPT), np.zeros(MOST_KEPT), np.zeros(r), np.zeros((r, r)), np.zeros((begins, hypotheses, r)),
+            np.zeros(MOST_KEPT),
+            np.zeros(MOST_KEPT),
+            np.zeros(r),
+            np.zeros((r, r)),
+            np.zeros((begins, hypotheses, r)),
             np.zeros((begins, channels, r)),
-        )  # fmt: skip
+        )
 
     @property
     def begins(self) -> NDArray[np.intp]:
@@ -96,9 +100,15 @@ class EarlierChanges(NamedTuple):
         before = (self.score, self.information, self.shared, self.sums)
         score, information, shared, sums = before if self.number else (np.zeros_like(part) for part in before)
         return self._replace(
-            score=score, information=information, shared=shared, sums=sums, number=self.number + 1, since=row,
-            looked=0, is_over=0,
-        )  # fmt: skip
+            score=score,
+            information=information,
+            shared=shared,
+            sums=sums,
+            number=self.number + 1,
+            since=row,
+            looked=0,
+            is_over=0,
+        )
 
     def with_change(self, place: int, hypothesis: int, score: float, information: float) -> EarlierChanges:
         """Return the state with one more change, of so much score and information; with no more than `MOST_KEPT`."""
