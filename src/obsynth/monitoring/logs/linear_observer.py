@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from typing import ClassVar, TypeVar
 
@@ -28,6 +28,9 @@ from obsynth.results.design import ObserverDesign
 GUARANTEED_SHARE, MOST_TRANSIENTS = 1e-3, 10
 
 SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing rows follow from the time stamps."
+
+#: Steps after a gap that are followed together.
+STEPS_AT_ONCE = 256
 
 #: What goes from row to row.
 SAVED = (
@@ -302,15 +305,21 @@ class LinearLogObserver(LogObserver):
         self.excess = remaining * missed
         if usual is None:
             return self.warm_up, self.warm_up
-        rows, waited, recovered = self.observer.Cz[self.shown], 0.0, self.warm_up
         longest_wait = MOST_TRANSIENTS * self.transient
         # The first row after a gap always counts as recovering.
-        while waited < max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0):
-            remaining, waited = a @ remaining, waited + step
-            effects = np.abs(rows @ remaining) @ missed
-            if np.all(effects <= usual):
-                recovered = min(recovered, waited)
-            if np.all(effects <= GUARANTEED_SHARE * usual):
+        most = max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0)
+        waited, recovered = 0.0, self.warm_up
+        for effects in _effects_by_step(self.observer.Cz[self.shown], a, remaining, missed):
+            # One after the other, as C adds them.
+            times = np.cumsum(np.concatenate([[waited], np.full(len(effects), step)]))
+            within = np.count_nonzero(times[:-1] < most)
+            quiet = np.flatnonzero((effects[:within] <= GUARANTEED_SHARE * usual).all(axis=1))
+            last = int(quiet[0]) + 1 if quiet.size else within
+            is_usual = np.flatnonzero((effects[:last] <= usual).all(axis=1))
+            if is_usual.size:
+                recovered = min(recovered, float(times[is_usual[0] + 1]))
+            waited = float(times[last])
+            if quiet.size or within < len(effects):
                 break
         return recovered, waited
 
@@ -414,3 +423,20 @@ class LinearLogObserver(LogObserver):
         row = np.full(len(self.observer.Cz), np.nan)
         row[self.observer.fault_rows] = self.fault[self.estimated_faults]
         return row
+
+
+def _effects_by_step(
+    rows: FloatArray, a: FloatArray, remaining: FloatArray, missed: FloatArray
+) -> Iterator[FloatArray]:
+    """Yield what is left in each row of what was missed, for steps one after the other ``(steps, rows)``: the first one
+    by one, then many at a time, as modes of an observer may be so slow that there are tens of thousands."""
+    for _ in range(STEPS_AT_ONCE):
+        remaining = a @ remaining
+        yield (np.abs(rows @ remaining) @ missed)[None]
+    moved = [rows @ a]
+    for _ in range(STEPS_AT_ONCE - 1):
+        moved.append(moved[-1] @ a)
+    each_step, power = np.array(moved), np.linalg.matrix_power(a, STEPS_AT_ONCE)
+    while True:
+        yield np.abs(each_step @ remaining) @ missed
+        remaining = power @ remaining
