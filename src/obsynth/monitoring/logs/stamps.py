@@ -327,6 +327,8 @@ class Stamps:
                 seconds = None
             if seconds is not None:
                 self.take_number()
+                if self.per_second is not None:
+                    return seconds if self.per_second == 1.0 else seconds / self.per_second
                 return float(self.seconds(np.array([seconds]))[0])
             elapsed = _ELAPSED.fullmatch(cell)
             if elapsed is not None:
