@@ -11,6 +11,7 @@ import pytest
 
 from obsynth import ObserverDesign
 from obsynth.cli import gain_sets
+from obsynth.files.inputs import protect
 from obsynth.report import designs as tables
 from obsynth.report import page
 from obsynth.report.terminal import output
@@ -28,6 +29,8 @@ def verified_again() -> Callable[[Path], Any]:
         content = hashlib.sha256(path.read_bytes()).digest()
         if content not in known:
             known[content] = really(path)
+        # As a file that is read is.
+        protect(path)
         return known[content]
 
     return remembered
