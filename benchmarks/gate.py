@@ -52,6 +52,9 @@ ALLOWED = 2.0
 #: and, where there are seeds enough for a median, where the median is above its bound by more than the first of these,
 #: or the worst by more than the second.
 ALLOWED_OF_MEDIAN, ALLOWED_OF_WORST = 1.5, 5.0
+
+#: Runs of a case and of its anchor that take turns.
+IN_TURN = 6
 SEEDS_OF_A_MEDIAN = 5
 #: So many times everything is measured again where a ratio is too large.
 MEASURED_AGAIN = 2
@@ -94,6 +97,13 @@ def seconds(action: Callable[[], object], runs: int = 1) -> float:
         action()
         found.append(time.process_time() - began)
     return min(found)
+
+
+def seconds_in_turn(*actions: Callable[[], object], runs: int) -> list[float]:
+    """Return processor seconds of each of some actions, the least of some runs: they take turns, as a machine that is
+    slower for a while is slower for all of them."""
+    rounds = [[seconds(action) for action in actions] for _ in range(runs)]
+    return [min(times) for times in zip(*rounds, strict=True)]
 
 
 def seconds_of_process(arguments: Sequence[str], compiled: Path | None, runs: int) -> float:
@@ -227,9 +237,11 @@ def records(*, small: bool) -> Iterator[Case]:
     problem = Problem.of(20, 5, 3)
     if small:
         problem = replace(problem, y=problem.y[:200], u=problem.u[:200])
-    observer, loop = observer_of(problem, adaptive=False), seconds(lambda: by_numpy(problem), 3)
-    yield Case("Kalman run, 20 states", "numpy loop",
-               [seconds(lambda: observer.run(problem.y, problem.u, compiled=False), 3)], loop)  # fmt: skip
+    observer = observer_of(problem, adaptive=False)
+    loop, ours = seconds_in_turn(
+        lambda: by_numpy(problem), lambda: observer.run(problem.y, problem.u, compiled=False), runs=IN_TURN
+    )
+    yield Case("Kalman run, 20 states", "numpy loop", [ours], loop)
     try:
         observer.run(problem.y, problem.u, compiled=True)
     except obsynth.SpecError:  # no numba
@@ -260,9 +272,10 @@ def logs(*, small: bool) -> Iterator[Case]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "log.csv"
         frame.to_csv(file, index=False)
-        anchored = seconds(lambda: pd.read_csv(file), 5)
-        yield Case("run on a log (CSV), 4 states", "pandas.read_csv",
-                   [seconds(lambda: obsynth.run_on_data(design, file), 3)], anchored)  # fmt: skip
+        anchored, ours = seconds_in_turn(
+            lambda: pd.read_csv(file), lambda: obsynth.run_on_data(design, file), runs=IN_TURN
+        )
+        yield Case("run on a log (CSV), 4 states", "pandas.read_csv", [ours], anchored)
 
 
 def cases(seeds: Sequence[int], *, small: bool) -> Iterator[tuple[Case, int]]:
