@@ -143,7 +143,7 @@ class ExactErrorSystem:
         best, least = None, np.inf
         for units in (self.units, np.ones(self.observer.order)):
             if (candidate := self._contraction(units)) is not None:
-                bounds = candidate[0].bounds(self.missed["K"][0], self.missed["J"][0].absolute())
+                bounds = candidate[0].bounds([self.missed["K"][0]], [self.missed["J"][0].absolute()])
                 if best is None or np.max(bounds, initial=0.0) < least:
                     best, least = candidate, float(np.max(bounds, initial=0.0))
         return best
@@ -156,7 +156,7 @@ class ExactErrorSystem:
                 g, covers = inverted
                 data = {"rate": number_data(rate), **written_data(witness), "G": g.data(), "G_covers": covers}
                 slowness = 1 - Fraction(rate) if self.discrete else Fraction(rate)
-                return ExactContraction(self.cz, witness["P"], g, slowness), data
+                return ExactContraction(self.cz, [witness["P"]], g, slowness), data
         return None
 
     def rounding_claim(self, contraction: ExactContraction) -> dict[str, Any] | None:
@@ -167,11 +167,11 @@ class ExactErrorSystem:
         own = {name: residuals[name][0].absolute() for name in ("J", "L", "W") if name in residuals}
         own["J"] = own["J"] + residuals["Z"][0].absolute()
         bounds = {
-            "states": contraction.bounds(residuals["K"][0], own["J"]),
-            "inputs": contraction.bounds(residuals["U"][0], own["L"]),
+            "states": contraction.bounds([residuals["K"][0]], [own["J"]]),
+            "inputs": contraction.bounds([residuals["U"][0]], [own["L"]]),
         }
         if self.model.decoupled:
-            bounds["disturbances"] = contraction.bounds(residuals["V"][0], own["W"])
+            bounds["disturbances"] = contraction.bounds([residuals["V"][0]], [own["W"]])
         count = 0 if self.model.Phi is None else len(self.model.Phi)
         rows = self.observer.fault_rows
         if count:
@@ -196,7 +196,7 @@ class ExactErrorSystem:
                     wanted[i, names.index(name)] = 1.0
             missed = missed + (self.cz @ trace + exact(wanted)).absolute()
             trace = self.az @ trace
-        bounds = contraction.bounds(trace, missed)
+        bounds = contraction.bounds([trace], [missed])
         own = [bounds[i, names.index(name)] for i, (kind, name, _) in enumerate(rows) if kind == "fault"]
         return None if max(own) > ESTIMATE_SHARE else {"claim": "faults", "bounds": matrix_data(bounds)}
 
@@ -222,7 +222,7 @@ class ExactErrorSystem:
                 goals[i] = [row.fraction(0, j) / mean for j in range(seen.shape[1])]
                 wanted[i] = [abs(float(value)) for value in goals[i]]
         own = [[abs(seen.fraction(i, j) - goals[i][j]) for j in range(seen.shape[1])] for i in range(seen.shape[0])]
-        bounds = contraction.bounds_beside(drives, own)
+        bounds = contraction.bounds_beside([drives], own)
         rows = self.observer.fault_rows
         if np.any((wanted[rows] > 0.0) & (bounds[rows] > ESTIMATE_SHARE * wanted[rows])):
             return None
@@ -333,23 +333,25 @@ class ExactContraction:
     """What columns of inputs do to each row at most, see ``Contraction`` of the checker."""
 
     cz: Dyadic
-    p: Dyadic
+    matrices: Sequence[Dyadic]  # P, or those at the vertices of a region
     g: Dyadic
     slowness: Fraction
 
-    def bounds(self, columns: Dyadic, own: Dyadic) -> FloatArray:
-        """Return what the checker accepts: own, and what columns add to it ``(rows, columns)``."""
-        parts = [[own.fraction(i, j) for j in range(own.shape[1])] for i in range(own.shape[0])]
-        return self.bounds_beside(columns, parts)
+    def bounds(self, columns: Sequence[Dyadic], own: Sequence[Dyadic]) -> FloatArray:
+        """Return what the checker accepts: the largest own part, and what any of the columns adds to it."""
+        rows, count = own[0].shape
+        largest = [[max(part.fraction(i, j) for part in own) for j in range(count)] for i in range(rows)]
+        return self.bounds_beside(columns, largest)
 
-    def bounds_beside(self, columns: Dyadic, own: list[list[Fraction]]) -> FloatArray:
+    def bounds_beside(self, columns: Sequence[Dyadic], own: list[list[Fraction]]) -> FloatArray:
         """Return the same, with own parts that are fractions."""
-        heights = [_entry(self.cz @ self.g @ self.cz.T, i) for i in range(self.cz.shape[0])]
-        lengths = [_entry(columns.T @ self.p @ columns, j) for j in range(columns.shape[1])]
-        bounds = np.zeros((len(heights), len(lengths)))
-        for i, height in enumerate(heights):
+        seen, count = self.cz @ self.g @ self.cz.T, columns[0].shape[1]
+        products = [each.T @ P @ each for each in columns for P in self.matrices]
+        lengths = [max(_entry(product, j) for product in products) for j in range(count)]
+        bounds = np.zeros((seen.shape[0], count))
+        for i in range(len(bounds)):
             for j, length in enumerate(lengths):
-                added = Fraction(root_above(height * length / self.slowness**2))
+                added = Fraction(root_above(_entry(seen, i) * length / self.slowness**2))
                 bounds[i, j] = rounded_outward((own[i][j] + added) * Fraction(BOUND_ROOM))
         return bounds
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from obsynth.exporting.exact_error_system import (
     rows_of,
     written_data,
 )
+from obsynth.exporting.proof_claims import ProofClaims
 from obsynth.exporting.proof_of_tests import test_claims
 from obsynth.exporting.proof_over_region import RegionProof
 from obsynth.files.outputs import write_atomically
@@ -139,13 +140,8 @@ def proof_bytes(data: Mapping[str, Any]) -> bytes:
 
 
 @dataclass
-class _Proof:
+class _Proof(ProofClaims):
     """Collects claims, and the names of those that are left out."""
-
-    design: ObserverDesign
-    claims: list[dict[str, Any]] = field(default_factory=list)
-    not_covered: list[str] = field(default_factory=list)
-    witness: dict[str, Any] | None = None
 
     @property
     def plant(self) -> DescriptorSystem:
@@ -200,31 +196,22 @@ class _Proof:
         """Write every claim that can be proved, and name the others."""
         if self.design.method == "guaranteed-test":
             for name, claim in test_claims(self.design):
-                self._add(name, claim)
+                self.add(name, claim)
         elif self.model is None:
             self.not_covered.append("the error system: what the observer follows is not known")
         else:
             self._of_the_error_system(self.model)
         self.not_covered += _NOT_COVERED.get(self.design.method, ["what the method claims by rows of its own"])
-        if self.design.source is not None:
-            self.not_covered.append(
-                "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
-            )
-
-    def _add(self, name: str, claim: Mapping[str, Any] | None) -> None:
-        if claim is None:
-            self.not_covered.append(name)
-        else:
-            self.claims.append(dict(claim))
+        self.leave_the_source()
 
     def _of_the_error_system(self, model: ErrorModel) -> None:
         system = ExactErrorSystem.of(self.plant, self.observer, model)
-        self._add(
+        self.add(
             "the identities hold to less than a thousandth of their terms",
             identities_claim("identities", system.missed.items()),
         )
         if self.observer.order:
-            self._add("stability: no Lyapunov matrix was found", self._stable(system))
+            self.add("stability: no Lyapunov matrix was found", self._stable(system))
             self._add_contraction(system)
         else:
             self._add_faults(system, None)
@@ -247,14 +234,14 @@ class _Proof:
             self._add_faults(system, None)
             return
         contraction, self.witness = contraction_and_witness
-        self._add("what rounding of stored numbers adds: too much for an estimate", system.rounding_claim(contraction))
+        self.add("what rounding of stored numbers adds: too much for an estimate", system.rounding_claim(contraction))
         self._add_faults(system, contraction)
         matrices = self.design.certificate.matrices
         if {"tracking", "Phi", "Cw", "T0"} <= matrices.keys() and len(matrices["Phi"]):
             mean = int(self.design.options.get("mean", 1))
             delay = int(self.design.options.get("delay", 0))
             claim = system.fault_models_claim(contraction, matrices, delay=delay, mean=mean)
-            self._add("faults that follow their models are estimated as they are", claim)
+            self.add("faults that follow their models are estimated as they are", claim)
 
     def _add_faults(self, system: ExactErrorSystem, contraction: ExactContraction | None) -> None:
         """Add that faults of any course are estimated; of an optimal filter this is the fault map, where it is late."""
@@ -267,7 +254,7 @@ class _Proof:
             return
         if optimal and claim is None:
             claim = self._fault_map_claim(system)
-        self._add("the fault map" if optimal else "each fault's own estimate: rounding may hide it", claim)
+        self.add("the fault map" if optimal else "each fault's own estimate: rounding may hide it", claim)
 
     def _add_gain_of_optimal_filter(self, system: ExactErrorSystem) -> None:
         """Add the gain of an optimal filter: of weighted signals, or from a reference model, by the claim for these."""
@@ -292,7 +279,7 @@ class _Proof:
                 claim = system.matching_claim(channel, self._rows, level, p, disturbances=counted)
             if claim is not None:
                 break
-        self._add(f"the gain {gain:.6g} of this filter", claim)
+        self.add(f"the gain {gain:.6g} of this filter", claim)
 
     @property
     def _rows(self) -> list[str]:
@@ -324,23 +311,23 @@ class _Proof:
         if "gamma" in claims and plant.nd and "P_factor" in matrices:
             factor = Dyadic.of(matrices["P_factor"])
             claim = system.gain_claim("disturbances", ["fault"], claims["gamma"], factor.T @ factor)
-            self._add(f"the l2 gain {claims['gamma']:.6g} from the disturbances", claim)
+            self.add(f"the l2 gain {claims['gamma']:.6g} from the disturbances", claim)
         if "fault_rate_gain" in claims and "P_rate" in matrices:
             gain = claims["fault_rate_gain"]
             claim = system.gain_claim("fault model", ["fault"], gain, Dyadic.of(matrices["P_rate"]))
-            self._add(f"the l2 gain {gain:.6g} from the rates of the faults", claim)
+            self.add(f"the l2 gain {gain:.6g} from the rates of the faults", claim)
         if "disturbance_gain" in claims and "P" in matrices:
             gain = claims["disturbance_gain"]
             p = dual_matrix(0.5 * (matrices["P"] + matrices["P"].T), gain)
             claim = None if p is None else system.gain_claim("disturbances and noise", ["residual"], gain, p)
-            self._add(f"the l2 gain {gain:.6g} from unknown inputs and noise", claim)
+            self.add(f"the l2 gain {gain:.6g} from unknown inputs and noise", claim)
         if self.design.method == "optimal-filter":
             self._add_gain_of_optimal_filter(system)
 
     def _add_deviation(self, system: ExactErrorSystem) -> None:
         rows = ["fault"] if self.observer.fault_names else ["residual"]
         if self.plant.nw and self.observer.order and (self.plant.Bw.any() or self.plant.Dw.any()):
-            self._add(f"standard deviations under {noise_words(self.plant.noise_names)}", system.deviation_claim(rows))
+            self.add(f"standard deviations under {noise_words(self.plant.noise_names)}", system.deviation_claim(rows))
 
 
 def _gain_witnesses(

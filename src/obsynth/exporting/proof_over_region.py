@@ -7,8 +7,8 @@ parameters that change slowly only is not covered.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from typing import Any
@@ -17,25 +17,24 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.exact_error_system import (
-    BOUND_ROOM,
     CONTRACTION_SHARES,
     ESTIMATE_SHARE,
     NORM_ROOM,
     OBSERVER_MATRICES,
     PLANT_MATRICES,
     RATE_SHARE,
+    ExactContraction,
     ExactErrorSystem,
     exact,
     identities_claim,
     matrix_data,
     rows_of,
 )
+from obsynth.exporting.proof_claims import ProofClaims
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
-from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.proofs.exact_arithmetic import rounded_outward
 from obsynth.proofs.witnesses import Dyadic, blocks, definite_witness, inverse_above, number_data, root_above
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -69,13 +68,8 @@ def refusal_over_region(design: ObserverDesign) -> str:
 
 
 @dataclass
-class RegionProof:
+class RegionProof(ProofClaims):
     """Collects the claims of a scheduled design, and the names of those that are left out."""
-
-    design: ObserverDesign
-    claims: list[dict[str, Any]] = field(default_factory=list)
-    not_covered: list[str] = field(default_factory=list)
-    witness: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if reason := refusal_over_region(self.design):
@@ -168,7 +162,7 @@ class RegionProof:
     def collect(self) -> None:
         """Write every claim that can be proved, and name the others."""
         missed = [(name, part) for system in self.systems for name, part in system.missed.items()]
-        self._add(
+        self.add(
             "the identities hold to less than a thousandth of their terms",
             identities_claim("identities over the region", missed),
         )
@@ -185,16 +179,7 @@ class RegionProof:
         self.not_covered += ALWAYS_LEFT
         if not self.discrete:
             self.not_covered.append("the steps of implicit Euler by which the observer runs")
-        if self.design.source is not None:
-            self.not_covered.append(
-                "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
-            )
-
-    def _add(self, name: str, claim: Mapping[str, Any] | None) -> None:
-        if claim is None:
-            self.not_covered.append(name)
-        else:
-            self.claims.append(dict(claim))
+        self.leave_the_source()
 
     def _lyapunov_matrices(self, name: str) -> list[Dyadic] | None:
         """Return the Lyapunov matrices of the certificate: one, or one for each vertex of a sampled plant."""
@@ -243,21 +228,21 @@ class RegionProof:
             rate = 1.0 - share * slowness if self.discrete else share * slowness
             found = found or self._decaying(matrices or [], rate)
         name = "decay: it is proved for parameters that change slowly" if self._is_slow else "decay over the region"
-        self._add(name, None if found is None else {"claim": "decay over the region", **found})
+        self.add(name, None if found is None else {"claim": "decay over the region", **found})
         contraction = None if matrices is None else self._contraction(matrices, slowness)
         if contraction is None:
             self.not_covered.append("what rounding of stored numbers adds: no contraction was found")
             return
-        self._add("what rounding of stored numbers adds: too much for an estimate", self._rounding(contraction))
+        self.add("what rounding of stored numbers adds: too much for an estimate", self._rounding(contraction))
         if self.design.method == "fault-estimation-filter" and self.observer.effectiveness_is_one:
-            self._add("each fault's own estimate: rounding may hide it", self._faults(contraction))
+            self.add("each fault's own estimate: rounding may hide it", self._faults(contraction))
 
     @property
     def _is_slow(self) -> bool:
         """Whether the parameters have rates: what is proved with these need not hold for jumps."""
         return any(rate is not None for rate in self.design.scheduled[0].scheduling.rates)
 
-    def _contraction(self, matrices: Sequence[Dyadic], slowness: float) -> _RegionContraction | None:
+    def _contraction(self, matrices: Sequence[Dyadic], slowness: float) -> ExactContraction | None:
         """Return a contraction with the Lyapunov matrices of the decay, and write its data."""
         for share in CONTRACTION_SHARES if slowness > 0.0 else ():
             rate = 1.0 - share * slowness if self.discrete else share * slowness
@@ -268,10 +253,10 @@ class RegionProof:
             G, covers = covering
             self.witness = {**witness, "G": G.data(), "G_covers": covers}
             own = 1 - Fraction(rate) if self.discrete else Fraction(rate)
-            return _RegionContraction(self.systems[0].cz, matrices, G, own)
+            return ExactContraction(self.systems[0].cz, matrices, G, own)
         return None
 
-    def _rounding(self, contraction: _RegionContraction) -> dict[str, Any] | None:
+    def _rounding(self, contraction: ExactContraction) -> dict[str, Any] | None:
         missed = [system.missed for system in self.systems]
         pairs = {"states": ("K", "J"), "inputs": ("U", "L")}
         pairs |= {"disturbances": ("V", "W")} if self.systems[0].model.decoupled else {}
@@ -289,7 +274,7 @@ class RegionProof:
             "bounds": {kind: matrix_data(bound) for kind, bound in bounds.items()},
         }
 
-    def _faults(self, contraction: _RegionContraction) -> dict[str, Any] | None:
+    def _faults(self, contraction: ExactContraction) -> dict[str, Any] | None:
         """Return that each fault shows in its own estimate a sample later, and nowhere else."""
         first, names = self.systems[0], self.design.scheduled[0].fault_names
         rows = rows_of(first.observer)
@@ -338,7 +323,7 @@ class RegionProof:
                 }
                 break
         slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
-        self._add(f"the l2 gain {claims[name]:.6g} from the {signal}{slow}", found)
+        self.add(f"the l2 gain {claims[name]:.6g} from the {signal}{slow}", found)
 
     def _add_mean_square(self) -> None:
         claims, matrices = self.design.certificate.claims, self._lyapunov_matrices(GAIN_WITNESSES[0])
@@ -369,33 +354,7 @@ class RegionProof:
                     "decreases": witnesses,
                 }
         slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
-        self._add(f"the mean square of the errors{slow}", found)
-
-
-@dataclass(frozen=True, eq=False)
-class _RegionContraction:
-    """What columns of inputs at the vertices do to each row at most, as the checker bounds it."""
-
-    cz: Dyadic
-    matrices: Sequence[Dyadic]
-    g: Dyadic
-    slowness: Fraction
-
-    def bounds(self, columns: Sequence[Dyadic], own: Sequence[Dyadic]) -> FloatArray:
-        """Return what the checker accepts: the largest own part, and what any of the columns adds to it."""
-        (rows, count), seen = own[0].shape, self.cz @ self.g @ self.cz.T
-        lengths = [Fraction(0)] * count
-        for each in columns:
-            for P in self.matrices:
-                products = each.T @ P @ each
-                lengths = [max(length, products.fraction(j, j)) for j, length in enumerate(lengths)]
-        bounds = np.zeros((rows, count))
-        for i in range(rows):
-            for j in range(count):
-                added = Fraction(root_above(seen.fraction(i, i) * lengths[j] / self.slowness**2))
-                largest = max(part.fraction(i, j) for part in own)
-                bounds[i, j] = rounded_outward((largest + added) * Fraction(BOUND_ROOM))
-        return bounds
+        self.add(f"the mean square of the errors{slow}", found)
 
 
 def _above_inverses(matrices: Sequence[Dyadic]) -> tuple[Dyadic, list[dict[str, Any]]] | None:

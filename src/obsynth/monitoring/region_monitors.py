@@ -3,7 +3,7 @@ rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -32,26 +32,25 @@ _SHOWN_LINES = (
 
 
 @dataclass(frozen=True, eq=False)
-class RegionMonitorInC:
-    """A bound on the residual for every course of the parameters as C: an `obsynth.exporting.alarms.ExportedMonitor`.
+class _NormAgainstLimitInC(ABC):
+    """The norm of the residual against a limit as C: an `obsynth.exporting.alarms.ExportedMonitor`, but for the limit.
 
-    ``table``: bounds by the row since the start; ``limit``: for ever after; ``fault_scales (nf,)``: what fault
-    estimates are compared in.
+    ``residuals``: how many there are; ``fault_scales (nf,)``: what fault estimates are compared in.
     """
 
     statement: str
-    table: FloatArray
-    limit: float
     residuals: int
     fault_names: tuple[str, ...]
     fault_scales: FloatArray
 
-    follows_rows: ClassVar[bool] = False
+    #: The file of C in which the limit is formed.
+    template: ClassVar[str]
 
     @property
     def variables(self) -> tuple[MonitorVariable, ...]:
         """The norm of the residual in units of its threshold, and the fault that an alarm points to."""
-        return _variables(self.statement, self.fault_names)
+        shown = MonitorVariable(STATISTIC, f"norm of the residual by its threshold: {self.statement}", "statistic")
+        return (shown, isolated_fault(self.fault_names))
 
     def watched_observer(self, observer: Any) -> Any:
         """Return the observer as it is."""
@@ -59,82 +58,99 @@ class RegionMonitorInC:
 
     def struct_lines(self, prefix: str) -> list[str]:
         """Return the declaration of the monitor's structure."""
-        return [
-            *_SHOWN_LINES,
-            "    int is_decided;",
-            "    long row;",
-            f"}} {prefix}_monitor;",
-            "",
-        ]
+        return [*_SHOWN_LINES, *self._own_fields(), f"}} {prefix}_monitor;", ""]
 
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor."""
-        sizes = {
-            "TABLE_LENGTH": len(self.table),
-            "MONITOR_RESIDUALS": self.residuals,
-            "MONITOR_FAULTS": len(self.fault_names),
-        }
+        sizes = {**self._sizes(), "MONITOR_RESIDUALS": self.residuals, "MONITOR_FAULTS": len(self.fault_names)}
+        tables = {**self._tables(), "monitor_scales": self.fault_scales[None]}
         lines = [
             f"enum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
-            f"#define MONITOR_LIMIT ((REAL){self.limit!r})",
-            *table_lines("monitor_table", filled_table(self.table[None])),
-            *table_lines("monitor_scales", filled_table(self.fault_scales[None])),
+            *(f"#define {name} ((REAL){float(value)!r})" for name, value in self._numbers().items()),
+            *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
+            *self._more_lines(),
         ]
-        templates = ("norm_against_limit.c", "region_threshold.c")
+        templates = ("norm_against_limit.c", self.template)
         return "\n".join(lines) + "".join(filled_template(name, prefix, {}, "obsynth.monitoring") for name in templates)
+
+    @abstractmethod
+    def _own_fields(self) -> list[str]:
+        """Return the fields of the structure that the limit is formed from."""
+
+    @abstractmethod
+    def _sizes(self) -> dict[str, int]:
+        """Return sizes by their names in C."""
+
+    @abstractmethod
+    def _numbers(self) -> dict[str, float]:
+        """Return numbers by their names in C."""
+
+    @abstractmethod
+    def _tables(self) -> dict[str, FloatArray]:
+        """Return tables by their names in C."""
+
+    def _more_lines(self) -> list[str]:
+        """Return other lines of C."""
+        return []
 
 
 @dataclass(frozen=True, eq=False)
-class FollowingRegionMonitorInC:
-    """Bounds on the residual in continuous time that follow the rows: an `obsynth.exporting.alarms.ExportedMonitor`.
+class RegionMonitorInC(_NormAgainstLimitInC):
+    """A bound on the residual for every course of the parameters.
 
-    ``rule``: its bounds; ``seconds`` between rows; ``function_places``: which parameter each function of the scheduling
-    is; ``fault_scales (nf,)``: what fault estimates are compared in.
+    ``table``: bounds by the row since the start; ``limit``: for ever after.
     """
 
-    statement: str
+    table: FloatArray
+    limit: float
+
+    follows_rows: ClassVar[bool] = False
+    template: ClassVar[str] = "region_threshold.c"
+
+    def _own_fields(self) -> list[str]:
+        return ["    int is_decided;", "    long row;"]
+
+    def _sizes(self) -> dict[str, int]:
+        return {"TABLE_LENGTH": len(self.table)}
+
+    def _numbers(self) -> dict[str, float]:
+        return {"MONITOR_LIMIT": self.limit}
+
+    def _tables(self) -> dict[str, FloatArray]:
+        return {"monitor_table": self.table[None]}
+
+
+@dataclass(frozen=True, eq=False)
+class FollowingRegionMonitorInC(_NormAgainstLimitInC):
+    """Bounds on the residual in continuous time that follow the rows.
+
+    ``rule``: its bounds; ``seconds`` between rows; ``function_places``: which parameter each function of the scheduling
+    is.
+    """
+
     rule: EulerRule
     seconds: float
     function_places: tuple[int, ...]
     vertices: int
     parameters: int
-    residuals: int
-    fault_names: tuple[str, ...]
-    fault_scales: FloatArray
 
     follows_rows: ClassVar[bool] = True
+    template: ClassVar[str] = "region_threshold_that_follows.c"
 
-    @property
-    def variables(self) -> tuple[MonitorVariable, ...]:
-        """The norm of the residual in units of its threshold, and the fault that an alarm points to."""
-        return _variables(self.statement, self.fault_names)
-
-    def watched_observer(self, observer: Any) -> Any:
-        """Return the observer as it is."""
-        return observer
-
-    def struct_lines(self, prefix: str) -> list[str]:
-        """Return the declaration of the monitor's structure."""
+    def _own_fields(self) -> list[str]:
         inputs, count = self.rule.bounds[0].errors.motion.B.shape[2], len(self.rule.bounds)
         return [
-            *_SHOWN_LINES,
             f"    REAL size[{count}], share[{count}], limit;",
             f"    REAL u[{max(inputs, 1)}], parameters[{self.parameters}], weights[{self.vertices}];",
             "    int has_before;",
-            f"}} {prefix}_monitor;",
-            "",
         ]
 
-    def source(self, prefix: str) -> str:
-        """Return the tables and functions of the monitor."""
+    def _sizes(self) -> dict[str, int]:
+        return {"BOUNDS": len(self.rule.bounds), "MOTIONS": self.rule.bounds[0].errors.motion.A.shape[1]}
+
+    def _numbers(self) -> dict[str, float]:
         first = self.rule.bounds[0].errors
-        sizes = {
-            "BOUNDS": len(self.rule.bounds),
-            "MOTIONS": first.motion.A.shape[1],
-            "MONITOR_RESIDUALS": self.residuals,
-            "MONITOR_FAULTS": len(self.fault_names),
-        }
-        numbers = {
+        return {
             "SECOND_ORDER": 0.5 * self.seconds * self.seconds,
             "THIRD_ORDER": third_order(first.growth, self.seconds),
             "SLOPE_OF_NOISE": first.slope_of_noise,
@@ -142,45 +158,34 @@ class FollowingRegionMonitorInC:
             "OUTWARD": OUTWARD,
             "FORGOTTEN_SHARE": FORGOTTEN_SHARE,
         }
-        lines = [
-            f"enum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
-            *(f"#define {name} ((REAL){float(value)!r})" for name, value in numbers.items()),
-            *(line for name, table in self._tables() for line in table_lines(name, filled_table(table))),
-            *(integer_table("function_places", self.function_places) if self.function_places else ()),
-        ]
-        templates = ("norm_against_limit.c", "region_threshold_that_follows.c")
-        return "\n".join(lines) + "".join(filled_template(name, prefix, {}, "obsynth.monitoring") for name in templates)
 
-    def _tables(self) -> Iterator[tuple[str, FloatArray]]:
-        """Yield names in C and numbers: of the plant's motion, and of each bound."""
+    def _tables(self) -> dict[str, FloatArray]:
+        """Return those of the plant's motion, and of each bound."""
         bounds = [bound.errors for bound in self.rule.bounds]
         first = bounds[0]
         motion = first.motion
-        yield from (
-            ("motion_A", np.vstack(list(motion.A))),
-            ("motion_B", np.vstack(list(motion.B))),
-            ("turned_A", np.vstack(list(first.A_turns))),
-            ("turned_B", np.vstack(list(first.B_turns))),
-            ("motion_estimated", motion.estimated),
-            ("motion_units", motion.units[None]),
-            ("slope_of_inputs", first.slope_of_inputs[None]),
-            ("drive", np.vstack([bound.drive for bound in bounds])),
-            ("drive_of_inputs", np.vstack([bound.drive_of_inputs for bound in bounds])),
-            ("turned_error", np.vstack([bound.turned_error for bound in bounds])),
-            ("turned_noise", np.vstack([bound.turned_noise for bound in bounds])),
-            ("drifts", np.array([[bound.drift for bound in bounds]])),
-            ("slopes_of_error", np.array([[bound.slope_of_error for bound in bounds]])),
-            ("decays", np.array([[bound.decay for bound in bounds]])),
-            ("driven", np.array([[bound.driven for bound in bounds]])),
-            ("gains", np.array([[bound.gain for bound in self.rule.bounds]])),
-            ("bound_starts", np.array([[-1.0 if b.start is None else b.start for b in self.rule.bounds]])),
-            ("monitor_scales", self.fault_scales[None]),
-        )
+        return {
+            "motion_A": np.vstack(list(motion.A)),
+            "motion_B": np.vstack(list(motion.B)),
+            "turned_A": np.vstack(list(first.A_turns)),
+            "turned_B": np.vstack(list(first.B_turns)),
+            "motion_estimated": motion.estimated,
+            "motion_units": motion.units[None],
+            "slope_of_inputs": first.slope_of_inputs[None],
+            "drive": np.vstack([bound.drive for bound in bounds]),
+            "drive_of_inputs": np.vstack([bound.drive_of_inputs for bound in bounds]),
+            "turned_error": np.vstack([bound.turned_error for bound in bounds]),
+            "turned_noise": np.vstack([bound.turned_noise for bound in bounds]),
+            "drifts": np.array([[bound.drift for bound in bounds]]),
+            "slopes_of_error": np.array([[bound.slope_of_error for bound in bounds]]),
+            "decays": np.array([[bound.decay for bound in bounds]]),
+            "driven": np.array([[bound.driven for bound in bounds]]),
+            "gains": np.array([[bound.gain for bound in self.rule.bounds]]),
+            "bound_starts": np.array([[-1.0 if b.start is None else b.start for b in self.rule.bounds]]),
+        }
 
-
-def _variables(statement: str, fault_names: tuple[str, ...]) -> tuple[MonitorVariable, ...]:
-    shown = MonitorVariable(STATISTIC, f"norm of the residual by its threshold: {statement}", "statistic")
-    return (shown, isolated_fault(fault_names))
+    def _more_lines(self) -> list[str]:
+        return integer_table("function_places", self.function_places) if self.function_places else []
 
 
 def region_monitor_in_c(monitor: Monitor, observer: ScheduledObserver, seconds: float | None) -> ExportedMonitor:
@@ -196,9 +201,11 @@ def region_monitor_in_c(monitor: Monitor, observer: ScheduledObserver, seconds: 
             path="monitor",
         )
     table, limit = bound
-    return RegionMonitorInC(
-        monitor.statement, table, float(limit), monitor.residuals, monitor.fault_names, monitor.fault_scales
-    )
+    return RegionMonitorInC(*_of_monitor(monitor), table, float(limit))
+
+
+def _of_monitor(monitor: Monitor) -> tuple[str, int, tuple[str, ...], FloatArray]:
+    return monitor.statement, monitor.residuals, monitor.fault_names, monitor.fault_scales
 
 
 def _following_monitor(
@@ -220,13 +227,10 @@ def _following_monitor(
             path="sample_time",
         )
     return FollowingRegionMonitorInC(
-        monitor.statement,
+        *_of_monitor(monitor),
         rule,
         seconds,
         tuple(scheduling.names.index(text) for text in scheduling.functions),
         observer.count,
         len(scheduling.names),
-        monitor.residuals,
-        monitor.fault_names,
-        monitor.fault_scales,
     )

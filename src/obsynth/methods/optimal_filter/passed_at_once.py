@@ -18,7 +18,7 @@ from obsynth.methods.optimal_filter.realisation import Followed, left_kernel_of
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE, but_rounding
+from obsynth.numerics.ranks import RANK_TOLERANCE, but_rounding, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.plant_units import PlantUnits
@@ -76,7 +76,8 @@ def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
     if follower.lag or index == 0:
         return follower
     if index == 1:
-        follower = follower._replace(T0=_product_without_rounding(follower.D, plant.C, _answer(plant)))
+        D, C, answer = follower.D, plant.C, _answer(plant)
+        follower = follower._replace(T0=but_rounding(D @ C @ answer, np.abs(D) @ np.abs(C) @ np.abs(answer)))
     return _without_rounding_passed(plant, fault_map, follower)
 
 
@@ -92,7 +93,7 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
     of_faults = None if weights is None or fault_map.exact else weights.faults
     ways = [(plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw)]
     faults, disturbances, noise = (
-        np.vstack([through, -_product_without_rounding(kernel, driven)]) for driven, through in ways
+        np.vstack([through, -product_but_rounding(kernel, driven)]) for driven, through in ways
     )
     models = [model for model in (of_faults, reference) if model is not None]
     passed = reduce(in_series, models)[3]
@@ -117,12 +118,6 @@ def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follo
         largest[plant.ny :] = np.max(kernel_sizes * entries[plant.ny :], initial=0.0) / kernel_sizes
         rows[i] = np.where(np.abs(row) > ROUNDED_SHARE * largest, row, 0.0)
     return follower._replace(D=rows[:, : plant.ny], T0=rows[:, plant.ny :] @ kernel)
-
-
-def _product_without_rounding(*factors: FloatArray) -> FloatArray:
-    """Return a product, its entries that are rounding of their terms set to zero."""
-    entries, terms = reduce(np.matmul, factors), reduce(np.matmul, [np.abs(factor) for factor in factors])
-    return np.where(np.abs(entries) > CANCELLATION_TOLERANCE * terms, entries, 0.0)
 
 
 def _answer(plant: DescriptorSystem) -> FloatArray:
