@@ -494,20 +494,102 @@ def test_floats_keep_the_bound_that_their_header_states(shipped: Shipped, tmp_pa
 
 
 @pytest.mark.long
-def test_c_ends_an_alarm_that_stands_since_the_start_as_a_run_does(shipped: Shipped, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("logs", "memory"), [(1, 40.0), (2, 0.0)])
+def test_c_ends_an_alarm_that_stands_since_the_start_as_a_run_does(
+    shipped: Shipped, tmp_path: Path, logs: int, memory: float
+) -> None:
     design, log = shipped.design(WALKING), log_of(shipped.design(WALKING))
     # A sensor that is off from the first row on, and levels that it passes in every row.
     log["Tair"] += 6.0 * np.sqrt(np.atleast_2d(design.observer.R)[0, 0])
-    learned = replace(told(design), levels=0.02 * told(design).levels)
+    learned = replace(told(design), levels=0.02 * told(design).levels, logs=logs, memory=memory)
     monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
     run = obsynth.run_on_data(design, log, monitor=monitor)
     assert any("taken for what is usual in this log" in text for text in run.warnings)
-    sources = obsynth.export(design, tmp_path / "walking.c", monitor=monitor, unverified=True)
-    text, width = harness(design, "walking")
-    (tmp_path / "run.c").write_text('#include "walking.h"\n' + text)
-    files = [str(file) for file in (*sources, tmp_path / "run.c") if file.suffix == ".c"]
-    subprocess.run([str(COMPILER), *FLAGS, *files, "-o", str(tmp_path / "run.so"), "-lm"], check=True)
-    count, pointer = len(design.observer.fault_names) + design.plant.ny + 3, ctypes.POINTER(ctypes.c_double)
-    given, out = np.concatenate([np.zeros(count), log.to_numpy()[:, 1:].ravel()]), np.zeros((ROWS, width))
-    ctypes.CDLL(str(tmp_path / "run.so")).run_walking(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), ROWS)
+    (out,) = rows_in_c(design, monitor, [log], tmp_path)
     np.testing.assert_allclose(out[:, -2], run.table["statistic"], rtol=1e-9)
+
+
+def rows_in_c(
+    design: obsynth.ObserverDesign, monitor: obsynth.types.Monitor, logs: Sequence[pd.DataFrame], folder: Path
+) -> list[np.ndarray]:
+    """Return what the C of a design with a monitor writes at each row of each log, without levels of its outputs."""
+    rate = {"sample_time": SAMPLE_TIME} if design.observer.dt == 0.0 else {}
+    sources = obsynth.export(design, folder / "exported.c", monitor=monitor, unverified=True, **rate)
+    text, width = harness(design, "exported")
+    (folder / "run.c").write_text('#include "exported.h"\n' + text)
+    files = [str(file) for file in (*sources, folder / "run.c") if file.suffix == ".c"]
+    subprocess.run([str(COMPILER), *FLAGS, *files, "-o", str(folder / "run.so"), "-lm"], check=True)
+    code, pointer = ctypes.CDLL(str(folder / "run.so")), ctypes.POINTER(ctypes.c_double)
+    nonlinear = isinstance(design.observer, DAEObserver)
+    residuals = design.plant.ny if nonlinear else len(design.observer.residual_names)
+    head = np.zeros(len(design.observer.fault_names) + residuals + 2 + nonlinear)
+    scales = getattr(design.plant, "scales", {})
+    found = []
+    for log in logs:
+        scaled = log.to_numpy()[:, 1:] * [scales.get(name, 1.0) for name in log.columns[1:]]
+        given, out = np.concatenate([head, scaled.ravel()]), np.zeros((len(log), width))
+        code.run_exported(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), len(log))
+        found.append(out)
+    return found
+
+
+def in_discrete_time() -> obsynth.DescriptorSystem:
+    return obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.05, 0.8]], B=[[1.0], [0.5]], C=np.eye(2), Bf=[[1], [0]], dt=1.0,
+        sensor_noise={"y1": 0.05, "y2": 0.05},
+    )  # fmt: skip
+
+
+#: One design of each kind whose residuals are watched.
+WATCHED = {
+    "PI observer": lambda: obsynth.ui_pi_observer(in_discrete_time()),
+    "fault estimation filter": lambda: obsynth.fault_estimation_filter(in_discrete_time()),
+    "functional filter": lambda: obsynth.functional_filter(in_discrete_time()),
+    "optimal filter": lambda: obsynth.optimal_filter(in_discrete_time()),
+    "PD observer": lambda: designed("smib/pd_observer"),
+    "Kalman filter with faults": lambda: designed(WALKING),
+    "Kalman filter with a slow sensor": lambda: designed(SLOWLY_SEEN),
+}
+
+
+def predicted_closely(design: obsynth.ObserverDesign) -> LearnedThresholds:
+    """Return thresholds of which one column is predicted to a tenth of its deviation: a row without the one before is
+    no evidence."""
+    thresholds = told(design)
+    model = thresholds.statistics.model
+    past = np.array([0.997 * np.eye(model.channels), np.zeros((model.channels, model.channels))])
+    close = Autoregression(0.003 * model.offset, past, model.whitener)
+    assert close.rests_on_the_past
+    return replace(thresholds, statistics=replace(thresholds.statistics, model=close))
+
+
+def with_gaps(log: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """Return a log without single cells, without rows, and without one output for some rows."""
+    rng, gaps, signals = np.random.default_rng(seed), log.copy(), list(log.columns[1:])
+    gaps.loc[:, signals] = gaps[signals].mask(rng.random((len(log), len(signals))) < 0.02)
+    for first in rng.integers(0, len(log), 3):
+        gaps.loc[first : first + rng.integers(0, 12), signals] = np.nan
+    first = int(rng.integers(0, len(log)))
+    gaps.loc[first : first + 8, signals[-1]] = np.nan
+    return gaps
+
+
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("kind", WATCHED)
+@pytest.mark.usefixtures("taken_as_verified")
+def test_c_after_gaps_says_what_a_run_says(kind: str, tmp_path: Path) -> None:
+    """Rows behind a gap are no evidence where a column is predicted closely, and are where it is not."""
+    design = WATCHED[kind]()
+    logs = [with_gaps(log_of(design), seed) for seed in range(3)]
+    for number, learned in enumerate((predicted_closely(design), told(design))):
+        monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for log, out in zip(logs, rows_in_c(design, monitor, logs, folder), strict=True):
+            run = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0, recovered="none").table
+            assert {"ok", "gap"} <= set(run.status)
+            statistic = run.statistic.to_numpy(float)
+            assert np.isfinite(statistic).sum() >= 20
+            np.testing.assert_array_equal(np.isnan(out[:, -2]), np.isnan(statistic))
+            np.testing.assert_allclose(out[:, -2], statistic, rtol=1e-8)
+            np.testing.assert_array_equal(out[:, -3] != 0.0, run.alarm != "")

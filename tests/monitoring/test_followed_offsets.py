@@ -102,3 +102,22 @@ def test_an_offset_from_the_first_row_on_ends_and_a_jump_soon_after_the_start_do
     assert any("when 200 rows had been decided" in text for text in later.warnings)
     quiet = obsynth.run_on_data(pumped(), log(6), monitor=monitor)
     assert not any("taken for what is usual" in text for text in quiet.warnings)
+
+
+@pytest.mark.long
+def test_two_logs_do_not_tell_an_offset_from_a_fault_either_and_three_do() -> None:
+    """A sensor that was off from the first row on was in alarm for nine of ten rows with thresholds of two logs."""
+    whole = log(5, rows=700)
+    whole["y"] += NOISE
+    runs = [
+        obsynth.run_on_data(
+            pumped(), whole, monitor=obsynth.online_monitor(pumped(), "learned", normal=replace(learned(), **few))
+        )
+        for few in ({"logs": 2, "memory": 0.0}, {"logs": 3, "memory": 0.0})
+    ]
+    two, three = (run.table["alarm"].ne("").to_numpy() for run in runs)
+    assert two[:200].any()
+    assert not two[200:].any()
+    assert any("2 logs, which do not distinguish an offset" in text for text in runs[0].warnings)
+    assert three[200:].mean() > 0.5
+    assert "2 logs do not distinguish" in replace(learned(), logs=2, memory=0.0).statement

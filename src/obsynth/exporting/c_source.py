@@ -377,7 +377,8 @@ def _step_text(realisation: Realisation, prefix: str, alarms: Alarms) -> str:
             if watched
             else "",
             "MONITOR_STEP": (
-                f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
+                f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK,\n"
+                f"                 s->status == {prefix.upper()}_GAP, -1);\n"
                 "    shown[SHOWN_COUNT] = s->monitor.statistic;"
                 if watched
                 else ""

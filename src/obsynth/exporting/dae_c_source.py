@@ -127,10 +127,10 @@ def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
         f"    for (i = 0; i < {prefix.upper()}_WATCHED; i++) {{\n"
         "        shown[i] = NAN;\n"
         "    }\n"
-        "    monitor_take(&s->monitor, shown, NULL, 0, -1);"
+        "    monitor_take(&s->monitor, shown, NULL, 0, 1, -1);"
     )
     taking = (
-        "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding,\n"
+        "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding, 0,\n"
         "                 sqrt(estimates->nis));\n"
         "    shown[NQ + NY + 1] = s->monitor.statistic;"
     )

@@ -144,7 +144,8 @@ class LearnedMonitorInC:
             "MONITOR_STATISTICS": len(learned.levels),
             "MONITOR_HOLD": HOLD,
             "MONITOR_RESTS": int(model.rests_on_the_past),
-            "MONITOR_OWN": OWN_ROWS[0],
+            "MONITOR_OFFSET": int(learned.memory > 0.0 or learned.takes_first_rows),
+            "MONITOR_OWN": OWN_ROWS[0] if learned.takes_first_rows else 0,
             "MONITOR_OWN_LATER": OWN_ROWS[1],
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }

@@ -344,12 +344,14 @@ class LogRun:
         return [*cells, "; ".join(names)]
 
     def taken_for_usual(self) -> tuple[str, ...]:
-        """Return a text where an alarm of thresholds from one log ended as it had stood since the start."""
+        """Return a text where an alarm of thresholds from few logs ended as it had stood since the start."""
         if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule) or not self._watching.rule.ended:
             return ()
+        logs = self.monitor.rule.learned.logs
+        few = "one log, which does" if logs == 1 else f"{logs} logs, which do"
         return (
             f"An alarm stood when {self._watching.rule.ended} rows had been decided, and was ended there: the "
-            "thresholds are of one log, which does not distinguish an offset of this log from a fault that was there "
+            f"thresholds are of {few} not distinguish an offset of this log from a fault that was there "
             "from its first row on, so that these rows are taken for what is usual in this log. If the alarm was a "
             "fault, it may still be there. Three normal logs tell (learn the thresholds from them).",
         )

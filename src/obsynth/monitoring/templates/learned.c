@@ -176,7 +176,7 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x, const REAL *kept, REAL
         e[i] *= most / size;
     }
     /* Follow a slow offset, by no more than noise moves it; more slowly in an alarm. */
-    for (i = 0; MONITOR_FOLLOW > 0 && x != NULL && most > 0 && i < CHANNELS; i++) {
+    for (i = 0; MONITOR_OFFSET && x != NULL && most > 0 && i < CHANNELS; i++) {
         REAL away = e[i] - m->slow[i];
         e[i] = away;
         away = away > MONITOR_FOLLOWED_MOST ? MONITOR_FOLLOWED_MOST : away;
@@ -347,7 +347,7 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
 {
     int is_finite = 1;
     int i;
-    if (!(MONITOR_FOLLOW > 0) || MONITOR_ESTIMATES == 0 || covariance == NULL || m->begun >= MONITOR_OWN_LATER) {
+    if (MONITOR_OWN == 0 || MONITOR_ESTIMATES == 0 || covariance == NULL || m->begun >= MONITOR_OWN_LATER) {
         return;
     }
     for (i = 0; i < CHANNELS; i++) {
@@ -435,9 +435,10 @@ static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
 }
 
 /* Take a row: fault estimates, then residuals; `covariance`: that of the fault estimates, or NULL where the observer has
- * none; `innovation`: its norm in the observer's own covariance, or less than zero where the gain does not follow what
- * is measured. */
-static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covariance, int deciding, REAL innovation)
+ * none; `is_gap`: nothing was measured, and the estimates are those of before; `innovation`: its norm in the observer's
+ * own covariance, or less than zero where the gain does not follow what is measured. */
+static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covariance, int deciding, int is_gap,
+                         REAL innovation)
 {
     REAL x[CHANNELS];
     REAL kept[CHANNELS];
@@ -447,7 +448,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     REAL levels[MONITOR_STATISTICS];
     int changed = -1;
     int which = 0;
-    int is_said = 1;
+    int is_said = !is_gap;
     int is_whole = deciding;
     int is_partly = 0;
     int seen[CHANNELS];

@@ -46,9 +46,13 @@ MOST_HEALTHY_TIME = 0.05
 #: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
 FAULTS_SLOWER = 2.0
 
-#: Thresholds of one log do not tell an offset of another log from a fault that is there from its first row on: an alarm
-#: that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is usual
-#: from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
+#: Logs from which on their differences show how far offsets of other logs go: the spread of two has one degree of
+#: freedom, and the interval that holds a third one reaches eleven times as far as they are apart.
+LOGS_FOR_OFFSETS = 3
+
+#: Thresholds of fewer logs do not tell an offset of another log from a fault that is there from its first row on: an
+#: alarm that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is
+#: usual from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
 OWN_ROWS = (100, 200)
 
 
@@ -183,6 +187,12 @@ class LearnedThresholds:
         return self.rows >= self.needed and self.healthy_time.expected <= MOST_HEALTHY_TIME
 
     @property
+    def takes_first_rows(self) -> bool:
+        """Whether the first rows of a run are taken for what is usual in its log, where they alarm: changes of faults
+        are watched, and the logs are too few to show which offsets others have."""
+        return bool(self.statistics.estimates) and self.logs < LOGS_FOR_OFFSETS
+
+    @property
     def statement(self) -> str:
         """What the thresholds mean, and whether the rows suffice for it."""
         text = "; ".join((*self._rate_in_words(), *self._drifts_in_words(), *self._dependence_in_words()))
@@ -229,8 +239,10 @@ class LearnedThresholds:
                 f"than about {self.memory:.6g} rows ({duration(self.memory * self.dt)}), and changes of the faults "
                 f"over more than {FAULTS_SLOWER * self.memory:.6g}, are followed and alarm nothing"
             )
+        if self.takes_first_rows:
+            few = "one log does" if self.logs == 1 else f"{self.logs} logs do"
             yield (
-                "nor does it distinguish a fault that is there from the first row of a run on from an offset of that "
+                f"{few} not distinguish a fault that is there from the first row of a run on from an offset of that "
                 f"log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends there, as the "
                 "means of these rows are taken for what is usual in this log"
             )

@@ -90,8 +90,9 @@ class LearnedRule(Rule):
     rows that are predicted from a missing one add no evidence, as none of these was learned from.
 
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
-    exponential means follow them, ten times more slowly after a row in alarm.  An alarm that stands
-    after the first `OWN_ROWS` rows of a run ends there: their means take the place of what the one log had."""
+    exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
+    that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had.
+    """
 
     def __init__(
         self,
@@ -120,6 +121,7 @@ class LearnedRule(Rule):
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
         self._ranges = learned.ranges
         self._shares = follow_shares(learned.memory)
+        self._has_offset = learned.memory > 0.0 or learned.takes_first_rows
 
     def init(self) -> LearnedState:
         """Return the state before the first sample."""
@@ -259,8 +261,8 @@ class LearnedRule(Rule):
     def _own_of_start(self, state: LearnedState, observation: Any, *, counts: bool) -> LearnedState:
         """Return the state after a row that may be one of the first of a log: where an alarm stands once these are
         enough, they are what is usual in this log, and the rows before say nothing against that."""
-        followed = self._walk is not None and self._shares[0] > 0.0
-        if not (followed and counts and isinstance(observation, Evidence)) or state.begun >= OWN_ROWS[-1]:
+        taken = self._walk is not None and self.learned.takes_first_rows
+        if not (taken and counts and isinstance(observation, Evidence)) or state.begun >= OWN_ROWS[-1]:
             return state
         white = np.clip(np.nan_to_num(state.white[-1] + state.slow), -OWN_MOST, OWN_MOST)
         own, begun = state.own + np.concatenate([white, observation.theta]), state.begun + 1
@@ -339,7 +341,7 @@ class LearnedRule(Rule):
             size = float(np.linalg.norm(e))
             e = e * (most / size) if size > most else e
         slow = state.slow
-        if self._shares[0] and evidence is not None and most:
+        if self._has_offset and evidence is not None and most:
             e = e - slow
             # A wrong sample moves the offset no more than noise does.
             slow = slow + self._shares[state.alarmed] * np.clip(np.nan_to_num(e), -FOLLOWED_MOST, FOLLOWED_MOST)
