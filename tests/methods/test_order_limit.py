@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import obsynth
+from obsynth.methods.registry import error_model
+from obsynth.results.design import Certificate
 
 #: A random walk on y2, and on y1 with the fault: what is late by three samples and remembers three is a sum of four
 #: samples of y2 with weights whose sum is one.
@@ -200,3 +203,101 @@ def test_a_search_that_reaches_no_error_at_all_ends_there() -> None:
     )
     design = obsynth.optimal_filter(case, reference={"bandwidth": 3.0}, decoupled="d1", order_limit=2)
     assert design.report.passed
+
+
+def _matching(seed: int, dt: float) -> tuple[obsynth.DescriptorSystem, dict[str, list[list[float]]]]:
+    """Return a plant without known inputs whose modes decay, outputs in units of their own, and a lag to be matched."""
+    rng = np.random.default_rng([4712, seed])
+    a = rng.normal(size=(4, 4))
+    poles = np.linalg.eigvals(a)
+    a = 0.85 * a / np.max(np.abs(poles)) if dt else a - (np.max(poles.real) + 0.3) * np.eye(4)
+    units = np.array([[1.0], [50.0]])
+    case = obsynth.DescriptorSystem(
+        A=a, C=units * rng.normal(size=(2, 4)), Bf=rng.normal(size=(4, 1)),
+        Bw=np.hstack([0.3 * rng.normal(size=(4, 1)), np.zeros((4, 2))]),
+        Dw=np.hstack([np.zeros((2, 1)), 0.3 * np.diag(units.ravel())]), dt=dt,
+    )  # fmt: skip
+    pole = 0.6 if dt else -1.5
+    return case, {"A": [[pole]], "B": [[1.0]], "C": [[1.0 - pole if dt else -pole]], "D": [[0.0]]}
+
+
+def _covariance(a: np.ndarray, b: np.ndarray, dt: float) -> np.ndarray:
+    if dt:
+        return scipy.linalg.solve_discrete_lyapunov(a, b @ b.T)
+    return scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
+
+
+def _truncated(parts: tuple[np.ndarray, ...], order: int, dt: float) -> tuple[np.ndarray, ...]:
+    """Return a balanced truncation by the square-root method, from the Gramians of scipy."""
+    a, b, c, d = parts
+    roots = []
+    for gramian in (_covariance(a, b, dt), _covariance(a.T, c.T, dt)):
+        sizes, directions = np.linalg.eigh(0.5 * (gramian + gramian.T))
+        roots.append(directions * np.sqrt(np.maximum(sizes, 0.0)))
+    left, values, right = np.linalg.svd(roots[1].T @ roots[0])
+    out = roots[0] @ right[:order].T / np.sqrt(values[:order])
+    into = (roots[1] @ left[:, :order] / np.sqrt(values[:order])).T
+    return into @ a @ out, into @ b, c @ out, d
+
+
+def _norm_of_error(case: obsynth.DescriptorSystem, reference: dict, parts: tuple[np.ndarray, ...], norm: str) -> float:
+    """Return the norm from faults and noise to what a filter misses of the reference model, by its whole cascade."""
+    (a, b, c, d), (ar, br, cr, _) = parts, (np.array(reference[name]) for name in "ABCD")
+    n, k, m = case.nx, len(a), len(ar)
+    whole = np.block([[case.A, np.zeros((n, k + m))], [b @ case.C, a, np.zeros((k, m))], [np.zeros((m, n + k)), ar]])
+    driven = np.block([[case.Bf, case.Bw], [b @ case.Df, b @ case.Dw], [br, np.zeros((m, case.nw))]])
+    read, through = np.hstack([d @ case.C, c, -cr]), np.hstack([d @ case.Df, d @ case.Dw])
+    if norm == "h2":
+        return float(np.sqrt(np.trace(read @ _covariance(whole, driven, case.dt) @ read.T) + np.sum(through**2)))
+    half = np.linspace(0.0, np.pi, 4000, endpoint=False)
+    points = np.exp(1j * half) if case.dt else 1j * np.tan(0.5 * half)
+    states = np.linalg.solve(points[:, None, None] * np.eye(len(whole)) - whole, driven.astype(complex))
+    return float(np.max(np.linalg.svd(read @ states + through, compute_uv=False)))
+
+
+@pytest.mark.parametrize(
+    ("seed", "dt", "norm"),
+    [
+        (0, 1.0, "h2"),
+        (1, 0.0, "h2"),
+        pytest.param(0, 1.0, "hinf", marks=pytest.mark.long),
+        pytest.param(2, 0.0, "hinf", marks=pytest.mark.long),
+    ],
+)
+def test_no_plain_truncation_is_better(seed: int, dt: float, norm: str, tmp_path) -> None:
+    case, reference = _matching(seed, dt)
+    full = obsynth.optimal_filter(case, reference=reference, exact=False, norm=norm)
+    shipped = [full.observer.Az, full.observer.By, full.observer.Cz, full.observer.Dy]
+    for order in (1, 2):
+        design = obsynth.optimal_filter(case, reference=reference, exact=False, norm=norm, order_limit=order)
+        assert design.report.passed
+        assert design.observer.order == order
+        plain = _norm_of_error(case, reference, _truncated(shipped, order, dt), norm)
+        own = [design.observer.Az, design.observer.By, design.observer.Cz, design.observer.Dy]
+        recomputed = _norm_of_error(case, reference, own, norm)
+        assert full.least * (1.0 - 1e-6) <= recomputed <= design.gain * (1.0 + 1e-6) <= plain * (1.0 + 1e-5)
+    assert any("are in the errors of this filter" in note for note in design.notes)
+    assert obsynth.verify(obsynth.load(design.save(tmp_path / "few.gains.json"))).passed
+
+
+def test_what_the_errors_hold_of_the_plant_is_verified() -> None:
+    case, reference = _matching(0, 1.0)
+    design = obsynth.optimal_filter(case, reference=reference, exact=False, norm="h2", order_limit=2)
+    matrices, claims = design.certificate.matrices, design.certificate.claims
+    held = matrices["modes_A"]
+    assert held.shape == (2 + case.nx, case.nx)
+    # From a start that is not at rest the errors die out with the plant's modes, as the error model says.
+    start = np.ones(case.nx)
+    y = np.array([case.C @ np.linalg.matrix_power(case.A, k) @ start for k in range(12)])
+    estimates = design.observer.run(y).faults[:, 0]
+    model = error_model(design)
+    error, expected = model.own @ case.E @ start, []
+    for _ in range(12):
+        expected.append(-float((model.observer.Cz @ error)[0]))
+        error = model.Az @ error
+    np.testing.assert_allclose(estimates, expected, atol=1e-9)
+    for changed in (held * 1.01, np.zeros_like(held), held[:, :2]):
+        other = design.replace(certificate=Certificate({**matrices, "modes_A": changed}, claims))
+        assert not obsynth.verify(other).passed
+    without = {name: part for name, part in matrices.items() if name not in ("modes_A", "modes_C")}
+    assert not obsynth.verify(design.replace(certificate=Certificate(without, claims))).passed

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SpecError, counted
 from obsynth.exporting.exact_error_system import (
     OBSERVER_MATRICES,
     PLANT_MATRICES,
@@ -149,7 +149,8 @@ class _Proof(ProofClaims):
 
     @property
     def observer(self) -> LinearObserver:
-        return self.design.linear[1]
+        """The shipped one, beside modes of the plant that its errors hold: nothing drives these, they stay at zero."""
+        return self.design.linear[1] if self.model is None else self.model.observer
 
     @cached_property
     def model(self) -> ErrorModel | None:
@@ -202,6 +203,11 @@ class _Proof(ProofClaims):
         else:
             self._of_the_error_system(self.model)
         self.not_covered += _NOT_COVERED.get(self.design.method, ["what the method claims by rows of its own"])
+        held = self.observer.order - self.design.linear[1].order
+        if held:
+            self.not_covered.append(
+                f"that the last {counted(held, 'state')} of the observer, which nothing drives, may be left out of it"
+            )
         self.leave_the_source()
 
     def _of_the_error_system(self, model: ErrorModel) -> None:

@@ -22,7 +22,8 @@ def state_solver(design: ObserverDesign) -> FloatArray | None:
         # The model needs every fault of the plant: an observer of some of them begins again after a gap.
         return None
     try:
-        own = error_model(design).own
+        # Modes of the plant beside the observer's own state are not in it.
+        own = error_model(design).own[: observer.order]
     except SpecError:
         return None
     return np.asarray(np.linalg.pinv(np.vstack([own[:, : plant.nx] @ plant.E, plant.C])))

@@ -11,6 +11,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed, least_deviation_of_every_start
+from obsynth.methods.optimal_filter.realisation import with_modes
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
@@ -53,10 +54,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     # Disturbances that are not decoupled count as noise.
     plant = seen_plant(plant, options["decoupled"])
     lag = matrices["T0"].shape[1] // plant.nx - 1
-    model = ErrorModel(plant, observer, matrices["T"], -matrices["T0"], lag=lag, decoupled=True)
+    # Modes of the plant that the errors hold stay at zero in the observer, which ships without them.
+    whole = with_modes(observer, matrices)
+    model = ErrorModel(plant, whole, matrices["T"], -matrices["T0"], lag=lag, decoupled=True)
     yield _decoupling(model, printed_digits)
     yield listed_gains(design, {name: matrices[name] for name in ("T", "T0")})
-    yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
+    yield stability_row(whole.Az, matrices["stability"], plant.dt, "Lyapunov")
     yield upper_bound_check(
         "order",
         "the filter has as many states as claimed: difference",
@@ -127,12 +130,15 @@ def _fits(design: ObserverDesign) -> bool:
         return False
     extra += 0 if weights is None else weights.order
     rows = plant.nf if reference is None else len(reference[2])
+    held = matrices["modes_A"].shape[-1] if "modes_A" in matrices else 0
+    order = observer.order + held
     shapes = {
-        "stability": (observer.order,) * 2,
-        "T": (observer.order, states),
+        "stability": (order,) * 2,
+        "T": (order, states),
         "T0": (rows, max(states // plant.nx, 1) * plant.nx),
     }
-    shapes |= {} if "P" not in matrices else {"P": (observer.order + extra,) * 2}
+    shapes |= {"modes_A": (order, held), "modes_C": (rows, held)} if {"modes_A", "modes_C"} & set(matrices) else {}
+    shapes |= {} if "P" not in matrices else {"P": (order + extra,) * 2}
     if "least" in claims:
         shapes |= {"invisible": (len(matrices.get("invisible", ())), 2), "samples": (1, 1)}
     shapes |= {"limit_point": (1, 2)} if "non_causal_limit" in claims else {}

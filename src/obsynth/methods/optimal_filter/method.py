@@ -60,7 +60,9 @@ class OptimalFilterMethod(Method):
         Most states of the filter, for small processors.  Where the filter of least gain has more, one of that order
         with the same fault map and decoupling is searched; its own gain is claimed beside ``least``, which is of
         filters of any order.  It is a local minimum: no claim says that it is the best of its order.  Neither the
-        plant's state nor known inputs drive its error; one that is cut without that may have less gain.
+        plant's state nor known inputs drive its error.  In model matching the plant's state may, where its modes decay
+        and no disturbance is decoupled: balanced truncation of the filter of least gain is tried as well, and a
+        search from there; the best filter is taken, and a note says whether its errors hold modes of the plant.
     steady_error_limit : float, optional
         Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
         design beyond it is refused.
@@ -81,7 +83,7 @@ class OptimalFilterMethod(Method):
         No causal filter has this fault map: the delay is too short, the faults have an unstable zero, or disturbances
         cannot be decoupled.
     InfeasibleError
-        No filter of ``order_limit`` states has this fault map; the message has the least order.
+        No filter of ``order_limit`` states has this fault map and follows the plant; the message has the least order.
     SolverError
         The Riccati equations have no usable solution, no level near the gain is proved, or no stable filter of
         ``order_limit`` states was found.
@@ -126,7 +128,7 @@ class OptimalFilterMethod(Method):
         "order": ClaimMeaning("", "states of the filter", "order"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
-        {"T", "T0", "stability", "P", "invisible", "samples", "limit_point", "dependent"}
+        {"T", "T0", "stability", "modes_A", "modes_C", "P", "invisible", "samples", "limit_point", "dependent"}
         | {f"reference_{name}" for name in "ABCD"}
     )
     # Its estimates are of the faults, but which noise counts is the caller's choice: only who names it gets it.
@@ -177,8 +179,13 @@ class OptimalFilterMethod(Method):
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:
-        """Return the plant as it is: without faults and noise every row is zero, as T and T0 prove."""
+        """Return the plant as it is: without faults and noise every row is zero, as T and T0 prove.
+
+        Modes of the plant that the errors hold are states of the observer here, which nothing drives."""
+        from obsynth.methods.optimal_filter.realisation import with_modes
+
         (plant, observer), matrices = design.linear, design.certificate.matrices
+        observer = with_modes(observer, matrices)
         return ErrorModel(
             plant,
             observer,

@@ -7,7 +7,8 @@ modes of the plant that die out by themselves and that it reads are followed by 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ class Followed(NamedTuple):
     T: FloatArray
     T0: FloatArray
     lag: int
+    undriven: int = 0  # so many last states are copies of modes that no known input drives
 
 
 def minimal(filter_: Model, *, discrete: bool | None = None) -> Model:
@@ -210,6 +212,31 @@ def observer_of(
     )
 
 
+def without_undriven(observer: LinearObserver, follower: Followed) -> tuple[LinearObserver, dict[str, FloatArray]]:
+    """Return an observer without copies that nothing drives, which stay at zero, and what its errors hold of them."""
+    own = observer.order - follower.undriven
+    if own == observer.order:
+        return observer, {}
+    a, c = observer.Az, observer.Cz
+    shipped = replace(observer, Az=a[:own, :own], Bu=observer.Bu[:own], By=observer.By[:own], Cz=c[:, :own])
+    return shipped, {"modes_A": a[:, own:], "modes_C": c[:, own:]}
+
+
+def with_modes(observer: LinearObserver, matrices: Mapping[str, FloatArray]) -> LinearObserver:
+    """Return an observer beside the modes of the plant that its errors hold: copies that nothing drives."""
+    if "modes_A" not in matrices:
+        return observer
+    modes, own = matrices["modes_A"], observer.order
+    count = modes.shape[1]
+    return replace(
+        observer,
+        Az=np.hstack([np.vstack([observer.Az, np.zeros((count, own))]), modes]),
+        Bu=np.vstack([observer.Bu, np.zeros((count, observer.Bu.shape[1]))]),
+        By=np.vstack([observer.By, np.zeros((count, observer.By.shape[1]))]),
+        Cz=np.hstack([observer.Cz, matrices["modes_C"]]),
+    )
+
+
 def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     """Return ``U (k, nx)`` and ``M (k, k)`` with ``U A = M U E``: finite modes that decay, where d does not drive them.
 
@@ -281,7 +308,9 @@ def _followed(
     )
     # Only the copies that are read.
     basis = reachable_basis(moved.T, np.vstack([into, c_past]).T) if count else np.zeros((0, 0))
+    basis, driven_count = _driven_first(basis, moved, copied @ (plant.B / _sizes_of_columns(plant.B)))
     into, c_past, moved = into @ basis, c_past @ basis, basis.T @ moved @ basis
+    moved[driven_count:, :driven_count] = 0.0
     copies, copy_count = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
     follower = Followed(
         np.block([[a, into], [np.zeros((copy_count, nz)), moved]]),
@@ -291,8 +320,30 @@ def _followed(
         np.vstack([t, copies]),
         s @ left_kernel,
         lag,
+        copy_count - driven_count,
     )
     return follower, share
+
+
+def modes_that_inputs_drive(plant: DescriptorSystem) -> int:
+    """Return how many of the modes that die out known inputs drive: no filter that reads them has fewer copies."""
+    rows, moved = _dying_modes(plant)
+    return reachable_basis(moved, rows @ (plant.B / _sizes_of_columns(plant.B))).shape[1] if plant.B.any() else 0
+
+
+def _sizes_of_columns(matrix: FloatArray) -> FloatArray:
+    sizes = np.linalg.norm(matrix, axis=0)
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def _driven_first(basis: FloatArray, moved: FloatArray, driving: FloatArray) -> tuple[FloatArray, int]:
+    """Return columns of the same span, those that known inputs drive first, and how many these are."""
+    if not basis.shape[1]:
+        return basis, 0
+    driven = reachable_basis(basis.T @ moved @ basis, basis.T @ driving)
+    if not driven.shape[1]:
+        return basis, 0
+    return basis @ np.hstack([driven, scipy.linalg.null_space(driven.T)]), driven.shape[1]
 
 
 def _cleaned_solution(

@@ -1,7 +1,8 @@
-"""Filters of few states that keep the fault map and the decoupling: the least order, and a filter of low gain.
+"""Filters of few states: the least order that keeps the fault map and the decoupling, and a filter of low gain.
 
 The filter of least gain has as many states as the plant, its reference model and its windows together.  One of fewer
-states is looked for among all left fractions that see neither the state, nor known inputs, nor decoupled disturbances.
+states is looked for among all left fractions that see neither the state, nor known inputs, nor decoupled disturbances;
+for model matching on plants whose modes decay also among all filters, whose errors hold these modes.
 """
 
 from __future__ import annotations
@@ -17,14 +18,21 @@ from obsynth.methods.optimal_filter.fault_maps import (
     filter_in_plant_units,
     unit_of_errors,
 )
+from obsynth.methods.optimal_filter.realisation import modes_that_inputs_drive
 from obsynth.methods.optimal_filter.reference import delayed
 from obsynth.methods.optimal_filter.weights import Weights, in_series
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.decoupling_windows import Channels, Model
+from obsynth.numerics.least_estimation import STABLE_RADIUS
 from obsynth.numerics.left_fractions import Criterion, FractionProblem, best_fraction, is_stabilised, least_degrees
+from obsynth.numerics.low_order_models import Target, is_stable, plainly_truncated, searched, truncations, weighed
 from obsynth.numerics.standard_form import StandardForm, cayley, standard_form, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.plant_units import PlantUnits
 
+#: So many filters that may read the plant's states are made, the best ones at the angles, beside the plain truncation.
+MOST_TRIED = 3
 #: Angles on the half circle at which the error is weighed, and the least one beside both ends.
 ANGLES, LEAST_ANGLE = 240, 1e-4
 
@@ -122,6 +130,63 @@ def _fractions(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fr
         ends,
     )
     return fractions, _criterion(plant, fault_map, None, norm, full.alpha)
+
+
+def free_filters(plant: DescriptorSystem, chosen: Designed, limit: int, norm: str) -> list[Designed]:
+    """Return filters of at most ``limit`` states that may read the plant's states, the plain truncation last.
+
+    They are for model matching without decoupled disturbances, on plants whose modes decay: none for others.  Of modes
+    that known inputs drive each takes a state, so that these do not reach the error.
+    """
+    fault_map, alpha = chosen.fault_map, chosen.problem.alpha
+    if fault_map.exact or plant.nd or not _decays(plant):
+        return []
+    limit -= modes_that_inputs_drive(plant)
+    if limit < 1:
+        return []
+    target = _free_target(plant, chosen, norm)
+    units, error = PlantUnits.of(plant).rounded().outputs, unit_of_errors(plant)
+    rate = 1.0 if plant.is_discrete else alpha
+    a, b, c, d = chosen.filter
+
+    def in_target_units(model: Model) -> Model:
+        a, b, c, d = model
+        return a / rate, b / units / rate, c / error, d / units / error
+
+    plain = plainly_truncated((a / rate, b / rate, c, d), limit, discrete=plant.is_discrete)
+    plain = plain[0] * rate, plain[1] * rate, plain[2], plain[3]
+    starts = [*truncations(in_target_units(chosen.filter), limit, target), in_target_units(plain)]
+    starts = [start for start in starts if is_stable(start, discrete=target.discrete)]
+    best = [*searched(starts, limit, target, norm), *starts]
+    best.sort(key=lambda one: weighed(one, target, norm))
+    models = [(a * rate, b * units * rate, c * error, d * units * error) for a, b, c, d in best[:MOST_TRIED]]
+    return [chosen._replace(filter=model, least=chosen.least_gain) for model in (*models, plain)]
+
+
+def _decays(plant: DescriptorSystem) -> bool:
+    modes = structure_of(plant).finite_eigenvalues
+    return bool(np.all(np.abs(modes) < STABLE_RADIUS) if plant.is_discrete else np.all(np.real(modes) < 0.0))
+
+
+def _free_target(plant: DescriptorSystem, chosen: Designed, norm: str) -> Target:
+    """Return what a filter is weighed by that may read everything: all that faults and noise do to the outputs."""
+    fault_map, alpha = chosen.fault_map, chosen.problem.alpha
+    channels, each = channels_of(plant, fault_map)
+    criterion = _criterion(plant, fault_map, _wanted(plant, fault_map, each, alpha), norm, alpha)
+    angles, discrete = criterion.angles, plant.is_discrete
+    points = np.exp(1j * angles) if discrete else 1j * alpha * np.tan(0.5 * angles)
+    driving = np.hstack([channels.Bf, channels.Bw])
+    states = np.linalg.solve(points[:, None, None] * channels.E - channels.A, driving.astype(complex))
+    shown = channels.C @ states + np.hstack([channels.Df, channels.Dw])
+    return Target(
+        points if discrete else points / alpha,
+        criterion.shares,
+        criterion.left_weight,
+        shown @ criterion.right_weight,
+        criterion.target @ criterion.right_weight,
+        discrete,
+        not _must_end(plant, norm),
+    )
 
 
 def _must_end(plant: DescriptorSystem, norm: str) -> bool:

@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from obsynth.errors import PreconditionError, SolverError, counted
+from obsynth.errors import InfeasibleError, PreconditionError, SolverError, counted
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
@@ -34,8 +34,8 @@ from obsynth.methods.optimal_filter.lasting_modes import (
 from obsynth.methods.optimal_filter.late_outputs import shows_later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
-from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
-from obsynth.methods.optimal_filter.reduced_order import filters_of_order
+from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations, without_undriven
+from obsynth.methods.optimal_filter.reduced_order import filters_of_order, free_filters
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
@@ -68,6 +68,10 @@ LASTING_NOTE = (
     "A mode of the plant does not decay, and no noise drives it: a filter of least gain may ignore it, and its "
     "errors do not decay then. This one was found with a little noise on that mode; its claims are for the plant "
     "without it."
+)
+MODES_NOTE = (
+    "Modes of the plant that decay are in the errors of this filter, not in its state: after a start that is not at "
+    "rest the errors die out as they do. Gains and deviations count from rest."
 )
 LATE_NOTE = (
     "Outputs of this plant show inputs of later samples (its index is 2 or more): this filter reads each output "
@@ -218,7 +222,7 @@ def _made(
     fault_map = chosen.fault_map
     own = plant if searched is None else searched
     chosen, follower, observer = _with_enough_noise(own, chosen, method.norm)
-    full = observer.order
+    full, follower = observer.order, follower._replace(undriven=0)
     if method.order_limit is not None and full > method.order_limit:
         chosen, follower, observer = _of_low_order(own, chosen, method.order_limit, full, method.norm)
     if searched is not None:
@@ -228,6 +232,8 @@ def _made(
     chosen = chosen if least is None else chosen._replace(least=min(least, chosen.gain))
     matrices, claims = certified(plant, chosen, observer, follower, method.norm)
     matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
+    observer, modes = without_undriven(observer, follower)
+    matrices, claims = matrices | modes, claims | {"order": float(observer.order)}
     reference = fault_map.reference
     if reference is not None:
         matrices |= {f"reference_{name}": part for name, part in zip("ABCD", reference, strict=True)}
@@ -254,6 +260,7 @@ def _made(
         if chosen.least is None or method.order_limit is None
         else (_reduced_note(chosen, observer.order, full, claims),)
     )
+    notes += (MODES_NOTE,) if modes else ()
     notes += () if searched is None else (LASTING_NOTE,)
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
 
@@ -273,25 +280,41 @@ def _recomputed_gain(
     return float(hinf_norm(a, b, c, d).upper)
 
 
-def _of_low_order(
-    plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str
-) -> tuple[Designed, Followed, LinearObserver]:
+_Realised: TypeAlias = tuple[Designed, Followed, LinearObserver]
+
+
+def _of_low_order(plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str) -> _Realised:
     """Return the filter of low order with the least gain of its own, of those whose realisation keeps the fault map.
 
     They come in the order of their norms at some angles, between which a gain may have its peak.
     """
-    best: tuple[Designed, Followed, LinearObserver] | None = None
-    for filter_ in filters_of_order(plant, chosen, limit, full, norm):
-        realised = _of_at_most(plant, filter_, limit, norm)
-        gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
-        if realised is not None and gain < (math.inf if best is None else best[0].gain):
-            best = filter_._replace(gain=gain), *realised
+    filters = free_filters(plant, chosen, limit, norm)
+    best = _best_of(plant, filters, limit, norm)
+    try:
+        bound = filters_of_order(plant, chosen, limit, full, norm)
+    except (InfeasibleError, SolverError):
+        if best is None:
+            raise
+        bound = []
+    best = _best_of(plant, bound, limit, norm, best)
     if best is not None:
         return best
     raise SolverError(
         f"The filters of at most {limit} states that were found keep the fault map by rounding only: the result is "
         f"inconclusive. Give a larger order_limit: the filter of least gain has {full} states."
     )
+
+
+def _best_of(
+    plant: DescriptorSystem, filters: Sequence[Designed], limit: int, norm: str, best: _Realised | None = None
+) -> _Realised | None:
+    """Return the filter of least gain of its own, of some and one that is known, that has a realisation."""
+    for filter_ in filters:
+        realised = _of_at_most(plant, filter_, limit, norm)
+        gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
+        if realised is not None and gain < (math.inf if best is None else best[0].gain):
+            best = filter_._replace(gain=gain), *realised
+    return best
 
 
 def _of_at_most(
@@ -302,7 +325,8 @@ def _of_at_most(
         follower, observer, missed = _realised(plant, chosen, norm)
     except SolverError:
         return None
-    return (follower, observer) if observer.order <= limit and missed <= EXACT_SHARE else None
+    fits = observer.order - follower.undriven <= limit and missed <= EXACT_SHARE
+    return (follower, observer) if fits else None
 
 
 def _reduced_note(chosen: Designed, order: int, full: int, claims: Mapping[str, float]) -> str:

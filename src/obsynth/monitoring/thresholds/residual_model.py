@@ -204,7 +204,10 @@ def residual_model(
         raise SpecError(f"Design {design.name!r} has no residual to monitor.", path="observer")
     errors = replace(error_model(design), plant=noisy)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
-    initial = errors.own @ (plant.E @ start) - observer_start(scenario, observer.order)
+    # Modes of the plant that the errors hold beside the observer's own state begin at zero in it.
+    begun = np.zeros(errors.observer.order)
+    begun[: observer.order] = observer_start(scenario, observer.order)
+    initial = errors.own @ (plant.E @ start) - begun
     reading, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
