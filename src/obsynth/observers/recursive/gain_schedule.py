@@ -39,14 +39,21 @@ class GainStep(NamedTuple):
     spread: FloatArray  # ``(nq, nq)``: square root of the covariance of the parameters
 
 
+#: From the gains of a step to the factor and Upsilon to go on from, or ``None``.
+Correction: TypeAlias = Callable[[int, GainStep], tuple[FloatArray, FloatArray] | None]
+
 #: Gains of the steps of an observer: `gain_steps`, or what remembers them.
 Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
 
 
 def gain_steps(
-    observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
+    observer: RecursiveObserver,
+    steps: int,
+    *,
+    received: NDArray[np.bool_] | None = None,
+    corrected: Correction | None = None,
 ) -> Iterator[GainStep]:
-    """Yield the gains of the first steps (``received (samples, ny)``)."""
+    """Yield the gains of the first steps (``received (samples, ny)``); ``corrected`` may change what comes after."""
     recursion = observer.recursion
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
@@ -99,7 +106,10 @@ def gain_steps(
                 noise=noise,
             )
             learn, retain = theta_gain @ innovation_map, np.eye(nq) - theta_gain @ regressor
-        yield GainStep(step, gain, parity, G, Upsilon, factor, learn, retain, parameters.spread)
+        taken = GainStep(step, gain, parity, G, Upsilon, factor, learn, retain, parameters.spread)
+        yield taken
+        if corrected is not None and not diffuse.shape[1] and not rounding.shape[1]:
+            factor, Upsilon = corrected(k, taken) or (factor, Upsilon)
 
 
 def shared_gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:

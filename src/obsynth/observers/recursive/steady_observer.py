@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.ranks import product_but_rounding
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
@@ -28,6 +29,18 @@ STILL_STEPS = 5
 
 #: Gains that are where they were so many steps before have settled, although their last digits go to and fro.
 STILL_FOR_LONG = 256
+
+
+#: Digits that go to and fro by rounding move over that time by at most so many times what they move in a step, and less
+#: than that share: states in units that differ by 1e6 left 1e-11.
+DRIFT, ROUNDED_GAINS = 2.0, 1e-8
+
+#: After so many steps the recursion goes on from where these gains would lead if they stayed: Newton's method for its
+#: limit, so many times, as slow plants take thousands of steps. Each doubles the digits; what needs more has no limit.
+STEPS_BETWEEN_LEAPS, MOST_LEAPS = 32, 16
+
+#: Constant gains are followed for two to this power of steps at most: slower ones have no limit to leap to.
+MOST_DOUBLINGS = 30
 
 
 class SteadyObserver(NamedTuple):
@@ -72,22 +85,25 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
     """Return the first step whose gains have settled."""
     last: GainStep | None = None
     early: GainStep | None = None
-    still, before = 0, np.inf
-    for k, gains in enumerate(gain_steps(observer, MOST_SETTLING_STEPS)):
-        if not k % STILL_FOR_LONG:
-            if early is not None and _moved(gains, early) <= SETTLED_GAINS:
-                return gains, k
-            early = gains
+    still, before, earlier, effect = 0, np.inf, np.inf, 0.0
+    for k, gains in enumerate(gain_steps(observer, MOST_SETTLING_STEPS, corrected=_leap)):
         # The correction of the start, which comes first with early constraints, has other rows.
-        if last is not None and last.gain.shape == gains.gain.shape:
-            moved = _moved(gains, last)
-            # What is left of a geometric series, from two of its terms.
-            rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
-            remaining = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
-            quiet = moved == 0.0 or (moved <= SETTLED_GAINS and remaining <= SETTLED_GAINS) or moved <= UNMOVED_GAINS
-            still, before = still + 1 if quiet else 0, moved
-            if still == STILL_STEPS:
+        if last is None or len(last.step.H) != len(gains.step.H):
+            effect = _effect_of_parameters(gains)
+        moved = np.inf if last is None else _moved(gains, last, effect)
+        if not k % STILL_FOR_LONG:
+            # What decays, even from side to side, is no rounding.
+            rounded = min(DRIFT * moved, ROUNDED_GAINS) if moved >= earlier / DRIFT else 0.0
+            if early is not None and _moved(gains, early, effect) <= max(SETTLED_GAINS, rounded):
                 return gains, k
+            early, earlier = gains, moved
+        # What is left of a geometric series, from two of its terms.
+        rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
+        remaining = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
+        quiet = moved == 0.0 or (moved <= SETTLED_GAINS and remaining <= SETTLED_GAINS) or moved <= UNMOVED_GAINS
+        still, before = still + 1 if quiet else 0, moved
+        if still == STILL_STEPS:
+            return gains, k
         last = gains
     raise SolverError(
         f"The gains do not settle within {MOST_SETTLING_STEPS} steps: a mode is almost unobservable, or has almost no "
@@ -96,20 +112,53 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
     )
 
 
-def _moved(now: GainStep, then: GainStep) -> float:
+def _leap(k: int, gains: GainStep) -> tuple[FloatArray, FloatArray] | None:
+    """Return the factor and Upsilon that the gains of a step would lead to if they stayed; ``None`` for no leap."""
+    leap, rest = divmod(k, STEPS_BETWEEN_LEAPS)
+    if rest or not 0 < leap <= MOST_LEAPS:
+        return None
+    step, ne = gains.step, len(gains.step.A)
+    if len(step.H) != gains.gain.shape[1]:
+        return None
+    transition, factor = gains.gain[:, :ne] @ step.A, product_but_rounding(gains.gain, step.noise)
+    if not abscissa(transition, 1.0) < 1.0:
+        return None
+    Upsilon = gains.Upsilon
+    if Upsilon.shape[1]:
+        drive = gains.gain[:, :ne] @ step.Phi - gains.gain[:, ne:] @ step.Psi
+        Upsilon = np.asarray(np.linalg.solve(np.eye(len(transition)) - transition, drive), dtype=np.float64)
+    for _ in range(MOST_DOUBLINGS):
+        further = transition @ factor
+        if np.all(np.linalg.norm(further, axis=1) <= np.finfo(np.float64).eps * np.linalg.norm(factor, axis=1)):
+            covariance = factor @ factor.T
+            short = _distance(covariance, gains.factor @ gains.factor.T) + _distance(Upsilon, gains.Upsilon)
+            return None if short <= ROUNDED_GAINS else (factor, Upsilon)
+        factor = np.asarray(np.linalg.qr(np.hstack([factor, further]).T, mode="r")).T
+        transition = transition @ transition
+    return None
+
+
+def _moved(now: GainStep, then: GainStep, effect: float) -> float:
     """Return the largest relative distance between two gains; infinite for those of other rows."""
     if now.gain.shape != then.gain.shape:
         return np.inf
-    return max(_distance(current, earlier) for current, earlier in zip(_parts(now), _parts(then), strict=True))
+    distances = (_distance(current, earlier) for current, earlier in zip(_parts(now), _parts(then), strict=True))
+    return max(_distance(now.Upsilon, then.Upsilon, effect), *distances)
+
+
+def _effect_of_parameters(gains: GainStep) -> float:
+    """Return how far parameters of size one move the state in one step: sensors may cancel it down to its rounding."""
+    driven = np.vstack([gains.step.Phi, gains.step.Psi])
+    return float(np.abs(np.linalg.pinv(gains.step.H) @ driven).max(initial=0.0))
 
 
 def _parts(gains: GainStep) -> tuple[FloatArray, ...]:
     # The sign of a direction of the innovation is free, its square is not.
-    return gains.gain, gains.Upsilon, gains.learn, gains.retain, gains.parity.T @ gains.parity, gains.G.T @ gains.G
+    return gains.gain, gains.learn, gains.retain, gains.parity.T @ gains.parity, gains.G.T @ gains.G
 
 
-def _distance(now: FloatArray, then: FloatArray) -> float:
-    size = float(np.abs(now).max(initial=0.0))
+def _distance(now: FloatArray, then: FloatArray, least: float = 0.0) -> float:
+    size = max(float(np.abs(now).max(initial=0.0)), least)
     return float(np.abs(now - then).max(initial=0.0)) / size if size else 0.0
 
 
