@@ -155,7 +155,7 @@ class TestDesign:
             "0.02",
             "Verified: all",
             "the model is exact",
-            "2 % settling time",
+            "the slowest mode falls to 2 % in",
         ):
             assert text in printed
         assert len(printed.splitlines()) <= 16

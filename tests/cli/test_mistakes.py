@@ -249,9 +249,9 @@ def test_a_plant_without_faults_is_not_said_to_have_some() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--time-column", "timestamp"], "Did you mean 'Timestamp'? Map it: --map time=Timestamp."),
-        (["--time-column", "Timestamp", "--map", "air=luft"], "Map it: --map air=YOUR_COLUMN."),
-        (["--time-column", "Timestamp", "--map", "air=AIR"], "Did you mean 'air'? Map it: --map air=air."),
+        (["--time-column", "timestamp"], "Did you mean 'Timestamp'? Map it: --map time=Timestamp, or columns="),
+        (["--time-column", "Timestamp", "--map", "air=luft"], "Map it: --map air=YOUR_COLUMN, or columns="),
+        (["--time-column", "Timestamp", "--map", "air=AIR"], "Did you mean 'air'? Map it: --map air=air, or columns="),
     ],
 )
 def test_a_column_that_is_missing_is_mapped_by_its_signal(words: list[str], told: str, tmp_path, capsys) -> None:

@@ -149,7 +149,10 @@ def test_the_verdict_comes_first(network, tmp_path):
     assert page.texts[1] == "smib: fault-estimation-filter"
     # What can be detected, how small and how soon; then whether it is verified.
     assert page.texts[2] == "What can be detected"
-    assert re.match(r"tm GENCLS 1: 0\.201 pu exceeds 5 standard deviations .* after .*; active power", page.texts[3])
+    sentence = (
+        r"tm GENCLS 1: 0\.201 pu exceeds 5 standard deviations .* after .*; a sine of amplitude 1 pu in active power"
+    )
+    assert re.match(sentence, page.texts[3])
     assert re.fullmatch(r"Verified: all \d+ checks hold\.", page.texts[4])
 
 

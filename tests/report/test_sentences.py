@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 import obsynth
 from obsynth.plants.constants import constants_box, shown
+from obsynth.report.headline import headline
+from obsynth.report.summary import summary
 from obsynth.verification.assumptions import Assumptions
 
 #: An auditor signs no more words than this.
@@ -141,3 +144,61 @@ def test_every_assumption_has_its_part_in_the_digest_and_in_the_words() -> None:
     assert shown(5.0) == "5"
     assert shown(0.25, "m") == "0.25 m"
     assert shown(1e15) == "1000000000000000.0"
+
+
+def test_a_course_that_is_no_sine_moves_an_estimate_further_than_the_page_says_of_sines() -> None:
+    # The estimate follows the fault and, beside it, an oscillation that the disturbance drives.
+    a, b, d = np.array([[0.5, 0.6, 0.0], [0.0, 0.7, 0.6], [0.0, -0.6, 0.7]]), np.eye(3)[:, :1], np.eye(3)[:, 2:]
+    plant = obsynth.DescriptorSystem(
+        None, a, C=[[1.0, 0.0, 0.0]], Bf=b, Bd=d, Dw=[[0.1]], dt=1.0, units={"d1": "N", "f1": "W"}
+    )
+    design = obsynth.optimal_filter(plant)
+    (line,) = [text for text in headline(design, None) if "moves the estimate" in text]
+    found = re.search(r"a sine of amplitude 1 N in d1 moves the estimate by up to ([\d.]+) W", line)
+    assert found is not None, line
+    observer = design.linear[1]
+    joined = np.block([[a, np.zeros((3, observer.order))], [observer.By @ plant.C, observer.Az]])
+    shown = np.hstack([observer.Dy[observer.fault_rows] @ plant.C, observer.Cz[observer.fault_rows]])[0]
+    state, response = np.concatenate([d[:, 0], np.zeros(observer.order)]), [0.0]
+    for _ in range(2_000):
+        response.append(float(shown @ state))
+        state = joined @ state
+    sines = np.exp(-1j * np.outer(np.linspace(0.0, np.pi, 2_001), np.arange(len(response)))) @ np.array(response)
+    assert np.max(np.abs(sines)) == pytest.approx(float(found.group(1)), rel=5e-3)
+    assert np.abs(response).sum() > 1.05 * np.max(np.abs(sines))  # what a disturbance of the worst signs reaches
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_peak_gains_over_tolerances_say_which_disturbances_and_vertices(design: Any, written: bool) -> None:
+    if written:
+        plant = obsynth.uncertain_system(
+            {
+                "A": [["-p", 1.0], [0.0, -2.0]],
+                "C": [[1.0, 0.0], [0.0, 1.0]],
+                "Bf": [[1.0], [0.0]],
+                "Bd": [[0.0], [1.0]],
+            },
+            {"p": {"nominal": 1.0, "tolerance": "2 %"}},
+        )
+        design = obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.1))
+        # The constant acts where the fault acts: no tolerance is too large for the error, until numbers overflow.
+        (most,) = [text for label, text in obsynth.robustness(design).facts() if label == "largest tolerances"]
+        assert "inf" not in most
+    (text,) = [text for label, text in obsynth.robustness(design).facts() if label == "peak gain, fhat[f1]"]
+    assert re.fullmatch(
+        r"\S+ at the worst of 2 vertices, for disturbances within 1( that are held between samples)?", text
+    )
+    assert text.endswith("held between samples") == written
+
+
+def test_the_time_of_the_slowest_mode_is_not_called_that_of_the_response() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[-1.0, 2.0], [0.0, -1.0]], C=[[1.0, 0.0], [0.0, 1.0]], Bf=[[1.0], [0.0]], Bd=[[0.0], [1.0]]
+    )
+    design = obsynth.ui_pi_observer(plant)
+    text, observer = " ".join(str(summary(design)).split()), design.linear[1]
+    found = re.search(r"dynamics the slowest mode falls to 2 % in ([\d.]+) s; observer of order", text)
+    assert found is not None, text
+    slowest = np.max(np.linalg.eigvals(observer.Az).real)
+    assert np.exp(slowest * float(found.group(1))) == pytest.approx(0.02, rel=0.2)
+    assert "settling time" not in text

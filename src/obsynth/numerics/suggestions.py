@@ -14,8 +14,8 @@ MUCH_FARTHER = 2.5
 #: So many letters of a name are taken as its beginning.
 LEAST_BEGINNING = 3
 
-#: So many names are listed at most, of a network with hundreds of states for one.
-MOST_LISTED = 24
+#: So many names are listed at most, of a network with hundreds of states for one, and so many letters of each.
+MOST_LISTED, MOST_LETTERS = 24, 60
 
 Given = ParamSpec("Given")
 
@@ -30,17 +30,44 @@ Meant = Callable[[str, Iterable[str], Iterable[str]], str]
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
     known = list(names)
+    if not _is_number(str(name)):
+        # The columns of a table without names are numbered: '1' is no slip of 'y1'.
+        known = [other for other in known if not _is_number(other)]
     close = _closest(str(name), known)
     if not close and len(str(name)) >= LEAST_BEGINNING:
         close = [other for other in known if other.startswith(str(name))][:3]
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+    return f" Did you mean {' or '.join(repr(shortened(other)) for other in close)}?" if close else ""
+
+
+def shortened(name: str) -> str:
+    """Return a name, or its beginning where it is as long as the line of a file that has no names."""
+    return name if len(name) <= MOST_LETTERS else f"{name[:MOST_LETTERS]}..."
+
+
+def quoted_names(names: Sequence[str]) -> str:
+    """Return names in quotation marks with commas between, long ones shortened, and of many how many more there are."""
+    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+    return f"{', '.join(repr(shortened(name)) for name in names[:MOST_LISTED]) or 'none'}{more}"
+
+
+def are_numbers(names: Sequence[str]) -> bool:
+    """Whether all names are numbers, as those of a table that has no names."""
+    return bool(names) and all(map(_is_number, names))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def there_are(name: Any, names: Iterable[Any]) -> str:
     """Return the end of a message: which names there are, and the ones that may be meant by a wrong one."""
     known = list(map(str, names))
     more = f" and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
-    return f"there are: {', '.join(known[:MOST_LISTED]) or 'none'}{more}.{suggestion(str(name), known)}"
+    return f"there are: {', '.join(map(shortened, known[:MOST_LISTED])) or 'none'}{more}.{suggestion(str(name), known)}"
 
 
 def _closest(name: str, known: Sequence[str]) -> list[str]:

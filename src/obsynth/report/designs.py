@@ -19,6 +19,7 @@ from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.automatic import SETTLING_SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
@@ -35,6 +36,7 @@ from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 from obsynth.results.registered import is_registered, registered
+from obsynth.verification.assumptions import Assumptions
 
 #: What is said above the notes of a gain set that is read: they are sentences, which whoever holds the file may change.
 UNVERIFIED_NOTES = "Notes as they were written with the design, which verify does not check:"
@@ -252,6 +254,17 @@ def estimate_figures(design: ObserverDesign, gains: FaultGains | None) -> Iterat
             figures["largest_gain"] = float(row.max())
             figures["largest_gain_from"] = design.plant.disturbance_names[int(row.argmax())]
         yield figures
+
+
+def is_of_held_disturbances(design: ObserverDesign) -> bool:
+    """Return whether gains or decoupling are claimed of a sampled plant whose disturbances may move between samples.
+
+    A guaranteed test says itself which disturbances it is for."""
+    plant, written = design.plant, None if design.source is None else design.source.plant
+    if not isinstance(plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver) or not plant.nd:
+        return False
+    sampled = isinstance(written, DescriptorSystem) and written.dt == 0.0 < plant.dt
+    return not is_guaranteed(design) and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
 
 
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:

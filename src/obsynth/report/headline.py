@@ -13,7 +13,7 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed, noise_words
-from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear
+from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear, is_of_held_disturbances
 from obsynth.results.layout import duration, number
 
 if TYPE_CHECKING:
@@ -103,6 +103,8 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
     names = design.plant.noise_names if isinstance(design.plant, DescriptorSystem) else ()
     noise = noise_words(names) if is_noise_assumed(names) else "the noise"
     steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
+    units = design.plant.units
+    held = ", if it is held between samples" if is_of_held_disturbances(design) else ""
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""
         sentence = f"{name}: "
@@ -120,7 +122,11 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
         elif figures["delay"]:
             sentence += f"; delay {duration(figures['delay_seconds'])}"
         if gain := figures.get("largest_gain", 0.0):
-            sentence += f"; {figures['largest_gain_from']} of 1 moves the estimate by up to {number(gain, digits=3)}"
+            source = figures["largest_gain_from"]
+            sentence += (
+                f"; a sine of amplitude {_size(1.0, units.get(source, ''))} in {source} moves the estimate by up to "
+                f"{_size(gain, unit)}{held}"
+            )
         yield f"{sentence}."
 
 

@@ -22,7 +22,6 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.modes import SETTLED_TO, transient
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -41,13 +40,13 @@ from obsynth.report.designs import (
     fault_estimates,
     followed_steps,
     gains_if_linear,
+    is_of_held_disturbances,
     unproved,
 )
 from obsynth.report.plants import plain_table
 from obsynth.report.plots.frequency import FaultGains
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
-from obsynth.verification.assumptions import Assumptions
 from obsynth.verification.constant_faults import CONSTANT_FAULT
 
 #: Faults, warnings and notes that are listed; the others are counted.
@@ -258,7 +257,8 @@ def _dynamics(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
+        # The whole response may take longer: where modes are alike, or large at first.
+        settling = f"the slowest mode falls to {100.0 * SETTLED_TO:g} % in {number(float(f'{seconds:.2g}'))} s"
         return f"{settling}; observer of order {design.observer.order}"
     if isinstance(design.observer, ScheduledObserver):
         decay = design.certificate.claims.get("region_decay", math.nan)
@@ -298,7 +298,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        held = ", disturbances held over each sample" if _is_of_held_disturbances(design) else ""
+        held = ", disturbances held over each sample" if is_of_held_disturbances(design) else ""
         yield f"the model is exact{held}" + ("; only --monitor pointwise accounts for tolerances" if some else "")
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
@@ -334,17 +334,6 @@ def _is_identity(covariance: object) -> bool:
     if isinstance(covariance, MatrixSequence):
         covariance = covariance.at(0) if covariance.is_constant else None
     return isinstance(covariance, np.ndarray) and np.array_equal(covariance, np.eye(len(covariance)))
-
-
-def _is_of_held_disturbances(design: ObserverDesign) -> bool:
-    """Return whether gains or decoupling are claimed of a sampled plant whose disturbances may move between samples.
-
-    A guaranteed test says itself which disturbances it is for."""
-    plant, written = design.plant, None if design.source is None else design.source.plant
-    if not isinstance(plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver) or not plant.nd:
-        return False
-    sampled = isinstance(written, DescriptorSystem) and written.dt == 0.0 < plant.dt
-    return not is_guaranteed(design) and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:

@@ -180,6 +180,13 @@ class Scenario:
         }
         return partial(Scenario, **arguments), ()
 
+    @property
+    def is_random(self) -> bool:
+        """Whether noise or a signal is drawn, so that another seed gives another run."""
+        profiles = (each for group in _ALLOWED for own in getattr(self, group).values() for each in own)
+        noisy = self.noise > 0.0 or any(self.sensor_noise.values())
+        return noisy or any(isinstance(each, Random) for each in profiles)
+
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed; one that ends earlier is without what would
         begin after that.

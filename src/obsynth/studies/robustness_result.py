@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,13 @@ from obsynth.files.outputs import write_atomically
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import freeze
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
+from obsynth.plants.transformations.moving_disturbances import continuous_behind
 from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import ROBUSTNESS
-from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL
+from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, MOST_VERTICES
+from obsynth.verification.over_tolerances.responses import LARGEST_FACTOR
 
 #: What a verdict over the box is called in texts.
 VERDICTS = {"proved": "proved", "refuted": "refuted", "open": "not decided"}
@@ -180,7 +183,10 @@ class Robustness:
         where = self._place_of_failure() if self.stable == "refuted" and self.regular != "refuted" else ""
         lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
         but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
-        yield "plant stable", VERDICTS[self.stable] + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
+        yield (
+            "plant stable",
+            VERDICTS[self.stable] + where + (f" ({counted(self.boxes, 'box', 'boxes')})" if self.boxes else "") + but,
+        )
         if self.sharing:
             yield "never distinguished from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
         if self.reason:
@@ -190,13 +196,26 @@ class Robustness:
         ever = ": bounds stay finite for ever" if self.finite_for_ever else ": bounds hold at each sample, but may grow"
         yield "loop radius", f"{self.loop_radius:.4g}{'' if self.reason else ever}"
         if self.largest_factor is not None:
-            share = self.largest_tolerance
-            percent = "" if share is None else f" ({100.0 * share:.3g} %)"
-            yield "largest tolerances", f"{self.largest_factor:.4g} times those stated{percent}"
+            yield "largest tolerances", self._largest_tolerances(self.largest_factor)
         yield "main contributors", _largest_shares(self.blame)
         yield "rows of the plant", _largest_shares(self.rows)
         for name, gain in self.vertex_gains.items():
-            yield f"largest gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
+            yield f"peak gain, {name}", f"{gain:.4g}{self._for_disturbances()}"
+
+    def _largest_tolerances(self, factor: float) -> str:
+        if not math.isfinite(factor):
+            return f"no limit up to {LARGEST_FACTOR:,.0f} times those stated"
+        share = self.largest_tolerance
+        percent = "" if share is None else f" ({100.0 * share:.3g} %)"
+        return f"{factor:.4g} times those stated{percent}"
+
+    def _for_disturbances(self) -> str:
+        """Return for which constants and disturbances the peak gains are."""
+        count = 2 ** len(self.box.names)
+        vertices = f"{count} vertices" if count <= MOST_VERTICES else f"{MOST_VERTICES} drawn vertices of {count}"
+        sampled = self.design is not None and continuous_behind(self.design.linear[0]) is not None
+        held = " that are held between samples" if sampled else ""
+        return f" at the worst of {vertices}, for disturbances within 1{held}"
 
     def _place_of_failure(self) -> str:
         if not self.breaking:
@@ -257,7 +276,8 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
     else:
         words.append(f"bounds of the observer's error may grow (loop radius {radius:.4g})")
     if factor is not None:
-        words.append(f"also for tolerances up to {factor:.4g} times as large")
+        limit = f"{factor:.4g}" if math.isfinite(factor) else f"{LARGEST_FACTOR:,.0f}"
+        words.append(f"also for tolerances up to {limit} times as large")
     linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
     return f"For every plant with {box}: {', '.join(words)}{linear}. Gain set {digest[:SHOWN_DIGITS]}."
 

@@ -100,12 +100,13 @@ def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
 
 
 def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
-    """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
+    """Return what an alarm passes at the end of a run, with what rounding may add; ``None`` where it is not the same in
+    each run, or decides nothing."""
     if isinstance(monitor, ParameterMonitor) or monitor.rule.adapts:
         return None
     if not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
         return None
-    return float(monitor.threshold[-1])
+    return float(monitor.threshold[-1] + monitor.floor)
 
 
 def _interval(item: Interval) -> str:

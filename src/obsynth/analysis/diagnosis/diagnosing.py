@@ -235,7 +235,7 @@ def _sentences(
         texts.append(f"{name}: {how}. A fault with this time course cannot be estimated.")
     if len(hiding) > MOST_ZEROS:
         texts.append(f"{name}: output-nulling at {len(hiding) - MOST_ZEROS} more points.")
-    if for_isolation.visible and for_isolation.derivatives:
+    if for_isolation.visible and for_isolation.derivatives and for_isolation.estimable:
         more = "s" if for_isolation.derivatives > 1 else ""
         needed = f"sample{more} of delay" if plant.dt > 0.0 else f"derivative{more} of the outputs"
         texts.append(

@@ -240,7 +240,7 @@ class Diagnosis:
                 _word(fault.detectable_at_rest),
                 _word(fault.step_estimable),
                 _word(fault.estimable),
-                _count(fault.order),
+                _count(fault.order) if fault.estimable else "0" if fault.step_estimable else "-",
                 _count(fault.residual_order),
                 str(fault.filter_order) if fault.estimable or fault.step_estimable else "-",
             )

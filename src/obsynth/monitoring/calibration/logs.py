@@ -21,7 +21,7 @@ from obsynth.monitoring.logs.signals import mapping_advice, time_advice
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.suggestions import there_are
+from obsynth.numerics.suggestions import quoted_names, there_are
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -205,7 +205,8 @@ def read_log(
         wanted = held[name]
         if wanted not in table:
             raise SpecError(
-                f"The log has no column {wanted!r} for {name!r}; {there_are(wanted, names)} {mapping_advice(name)}",
+                f"The log has no column {wanted!r}{'' if wanted == name else f' for {name!r}'}; "
+                f"{there_are(wanted, names)} {mapping_advice(name)}",
                 path=f"columns.{name}",
             )
         numbers = _numbers(table[wanted], wanted, length)[first:last]
@@ -214,7 +215,7 @@ def read_log(
     in_table = held["time"] in table
     if not in_table and dt is None:
         raise SpecError(
-            f"The log has no column 'time'; it has {', '.join(map(repr, names))}. "
+            f"The log has no column 'time'; it has {quoted_names(names)}. "
             f"{time_advice(names) or 'Name it by columns.'} In Python, dt stands for the stamps of an even log.",
             path="columns.time",
         )

@@ -71,7 +71,7 @@ def never_measured(column: str, signal: str) -> str:
     """Return what is wrong with a column without a number, and what mends it."""
     return (
         f"The column {column!r} holds no number: {signal!r} is never measured. Name the column that holds it (--map "
-        f"{shlex.quote(signal)}=COLUMN), or leave it out of the plant."
+        f"{shlex.quote(signal)}=COLUMN, or columns={{{signal!r}: 'COLUMN'}}), or leave it out of the plant."
     )
 
 

@@ -17,7 +17,7 @@ from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.measurement_units import MICRO_SIGNS, conversion
-from obsynth.numerics.suggestions import suggestion, there_are
+from obsynth.numerics.suggestions import are_numbers, quoted_names, suggestion, there_are
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
@@ -189,8 +189,8 @@ def missing_columns(header: Sequence[str], missing: Sequence[str], signals: Mapp
         ((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER)
     )
     return SpecError(
-        f"The data have no column {', '.join(map(repr, missing))}; they have "
-        f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing, column, signal)}",
+        f"The data have no {'column' if len(missing) == 1 else 'columns'} {quoted_names(missing)}; they have "
+        f"{quoted_names(header)}. {_advice(header, missing, column, signal)}",
         path="data",
     )
 
@@ -269,6 +269,8 @@ def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: 
     """Return what to do about columns that are missing, such as this one of a signal, or of the time."""
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
+    if are_numbers(header):
+        return "These are numbers, not names: name the columns in the first line of a file, or in DataFrame.columns."
     if TIME_HEADER in missing and (advice := time_advice(header)):
         return advice
     meant = next((name for name in header if name.casefold() == column.casefold()), "YOUR_COLUMN")
@@ -277,8 +279,8 @@ def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: 
 
 
 def mapping_advice(signal: str, column: str = "YOUR_COLUMN") -> str:
-    """Return how a signal is mapped to a column, as a sentence."""
-    return f"Map it: --map {shlex.quote(signal)}={shlex.quote(column)}."
+    """Return how a signal is mapped to a column, on the command line and in Python, as a sentence."""
+    return f"Map it: --map {shlex.quote(signal)}={shlex.quote(column)}, or columns={{{signal!r}: {column!r}}}."
 
 
 def time_advice(header: Sequence[str]) -> str:

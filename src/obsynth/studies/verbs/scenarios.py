@@ -25,6 +25,12 @@ if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
     from obsynth.simulation.scenario import Scenario
 
+#: Said of runs of which only the seeds differ, where nothing is drawn.
+_ALL_ALIKE = (
+    "All runs are the same, as the scenario has neither noise nor a random signal: one run says as much, and the "
+    "intervals have no meaning."
+)
+
 
 def _run_tolerances(options: argparse.Namespace) -> int:
     """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
@@ -109,6 +115,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 **({} if options.confidence is None else {"confidence": options.confidence}),
             )
     least_data, sentences = _least_thresholds(design, scenario)
+    if options.plants is None and evaluation.runs > 1 and not scenario.is_random:
+        sentences = [_ALL_ALIKE, *sentences]
     emit(
         options,
         {

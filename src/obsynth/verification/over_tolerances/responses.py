@@ -183,7 +183,10 @@ def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: floa
     def radius_at(factor: float) -> float:
         if factor not in known:
             try:
-                known[factor] = loop_radius(responses_of(structure_at(factor)))
+                with np.errstate(over="ignore", invalid="ignore"):
+                    structure = structure_at(factor)
+                    # Of a plant that grows beyond all numbers nothing is known.
+                    known[factor] = loop_radius(responses_of(structure)) if _is_finite(structure) else np.inf
             except PreconditionError:
                 known[factor] = np.inf
         return known[factor]
@@ -203,6 +206,11 @@ def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: floa
         if high < 1.0 / LARGEST_FACTOR:
             return 0.0
     return low
+
+
+def _is_finite(structure: ErrorStructure) -> bool:
+    parts = (structure.state, structure.inputs, structure.disturbances)
+    return all(np.isfinite(part.spread + part.radius).all() for part in parts)
 
 
 def blame(responses: Responses) -> FloatArray:
