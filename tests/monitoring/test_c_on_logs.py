@@ -593,3 +593,17 @@ def test_c_after_gaps_says_what_a_run_says(kind: str, tmp_path: Path) -> None:
             np.testing.assert_array_equal(np.isnan(out[:, -2]), np.isnan(statistic))
             np.testing.assert_allclose(out[:, -2], statistic, rtol=1e-8)
             np.testing.assert_array_equal(out[:, -3] != 0.0, run.alarm != "")
+
+
+@pytest.mark.usefixtures("taken_as_verified")
+def test_c_raises_levels_where_residuals_swing_as_a_run_does(tmp_path: Path) -> None:
+    design = obsynth.fault_estimation_filter(in_discrete_time())
+    log = log_of(design)
+    log["y1"] = np.sin(np.arange(ROWS) / 8.0)
+    low = 0.02 * told(design).levels
+    low[0] *= 10.0
+    monitor = obsynth.online_monitor(design, "learned", normal=replace(told(design), levels=low), sensor_faults=False)
+    run = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0, recovered="none")
+    assert any("swing to both sides" in text for text in run.warnings)
+    (out,) = rows_in_c(design, monitor, [log], tmp_path)
+    np.testing.assert_allclose(out[:, -2], run.table["statistic"], rtol=1e-9)

@@ -18,6 +18,7 @@ from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, OWN_MOST, 
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
+from obsynth.monitoring.thresholds.swings import LEAST_SWINGS, ROW_MEMORY, SWING, SWING_MEMORY, SWING_ROOM
 from obsynth.monitoring.thresholds.watched_columns import as_learned, watched_names
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
@@ -68,6 +69,7 @@ class LearnedMonitorInC:
         model = self.learned.statistics.model
         m, width = model.channels, max(len(self.learned.statistics.estimates), 1)
         inputs = 0 if self.learned.ranges is None else self.learned.ranges.inputs
+        swinging = len(FORGETTING) * m + len(self.learned.statistics.responses()[0])
         return [
             "typedef struct {",
             "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
@@ -85,6 +87,11 @@ class LearnedMonitorInC:
             f"    REAL scores[{max(AGES) * 2 * width}];",
             f"    REAL centres[{width}];",
             f"    REAL own[{m + width}];",
+            f"    REAL swing_high[{swinging}];",
+            f"    REAL swing_low[{swinging}];",
+            f"    REAL swing_count[{swinging}];",
+            f"    int swing_side[{swinging}];",
+            "    REAL swing_row;",
             f"    REAL repeated[{max(self.outputs, 1)}];",
             f"    long equal[{max(self.outputs, 1)}];",
             f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
@@ -151,11 +158,13 @@ class LearnedMonitorInC:
         }
 
     def _follow_numbers(self) -> dict[str, float]:
-        """Return how an offset of residuals is followed, by the names of the numbers in C."""
+        """Return how an offset of residuals is followed, and how levels follow swings, by the names in C."""
         usual, in_alarm = follow_shares(self.learned.memory)
         return {
             "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
             "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
+            "MONITOR_SWING": SWING, "MONITOR_LEAST_SWINGS": LEAST_SWINGS, "MONITOR_SWING_ROOM": SWING_ROOM,
+            "MONITOR_SWING_KEPT": 1.0 - 1.0 / SWING_MEMORY, "MONITOR_ROW_KEPT": 1.0 - 1.0 / ROW_MEMORY,
         }  # fmt: skip
 
     def _tables(self) -> dict[str, Any]:

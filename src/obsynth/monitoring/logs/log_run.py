@@ -356,6 +356,21 @@ class LogRun:
             "fault, it may still be there. Three normal logs tell (learn the thresholds from them).",
         )
 
+    def swinging(self) -> tuple[str, ...]:
+        """Return a text where levels of learned thresholds were raised, as residuals swing to both sides."""
+        if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule):
+            return ()
+        swings = self._watching.rule.swings
+        if swings.since is None:
+            return ()
+        return (
+            f"Residuals swing to both sides, slowly and beyond what was learned, since "
+            f"{self._time_text(swings.since)}: a fault stays on one side, so that noise has become slower than in the "
+            "rows that the thresholds were learned from, or something swings that the model does not have. Levels of "
+            f"slow changes are up to {swings.most:.2g} times as high since then, and smaller faults are missed. Where "
+            "the plant is as it should be, learn the thresholds again with this log among the normal ones.",
+        )
+
     def _time_text(self, time: float) -> str:
         return f"{time:.15g}" if self.stamps is None else self.stamps.shown(time)
 

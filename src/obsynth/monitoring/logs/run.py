@@ -363,6 +363,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
             *stuck_texts(stuck),
             *(() if run.beyond is None else run.beyond.texts(run.rows)),
             *run.taken_for_usual(),
+            *run.swinging(),
         ),
         digest=digest,
         stamps=stamps,

@@ -2,6 +2,16 @@
 /* The monitor that was learned from rows without faults: whitening, Hotelling's T2, exponentially weighted means, and
  * likelihood ratios of steps and ramps of any age. Sizes and tables stand before this text. */
 
+static void monitor_calm(PREFIX_monitor *m)
+{
+    int i;
+    for (i = 0; i < MEANS * CHANNELS + SHAPES; i++) {
+        m->swing_high[i] = m->swing_low[i] = m->swing_count[i] = 0;
+        m->swing_side[i] = 0;
+    }
+    m->swing_row = 0;
+}
+
 static void monitor_reset(PREFIX_monitor *m)
 {
     int i, j;
@@ -31,6 +41,7 @@ static void monitor_reset(PREFIX_monitor *m)
     for (i = 0; i < CHANNELS + MONITOR_WIDTH; i++) {
         m->own[i] = 0;
     }
+    monitor_calm(m);
     m->begun = 0;
     for (i = 0; i < MONITOR_OUTPUTS; i++) {
         m->repeated[i] = 0;
@@ -214,8 +225,33 @@ static REAL beyond(REAL value, REAL band)
     return far <= 0 ? 0 : far;
 }
 
-/* The largest likelihood ratio over all ages of one step or ramp. */
-static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
+/* How far a statistic is on each side of late, whose ratio to its level has the sign of that; return by which factor
+ * levels are raised where it swings: it changes sides, where a fault stays on one. */
+static REAL monitor_swing(PREFIX_monitor *m, int i, REAL ratio)
+{
+    REAL both;
+    int side;
+    ratio = isfinite(ratio) ? ratio : 0;
+    side = ABS(ratio) > MONITOR_SWING ? (ratio > 0 ? 1 : -1) : 0;
+    m->swing_high[i] *= MONITOR_SWING_KEPT;
+    m->swing_low[i] *= MONITOR_SWING_KEPT;
+    m->swing_count[i] *= MONITOR_SWING_KEPT;
+    m->swing_high[i] = ratio > m->swing_high[i] ? ratio : m->swing_high[i];
+    m->swing_low[i] = -ratio > m->swing_low[i] ? -ratio : m->swing_low[i];
+    if (side != 0 && side != m->swing_side[i]) {
+        m->swing_side[i] = side;
+        m->swing_count[i] += 1;
+    }
+    both = m->swing_high[i] < m->swing_low[i] ? m->swing_high[i] : m->swing_low[i];
+    /* Noise that is slower makes means larger than single rows. */
+    both /= m->swing_row > 1 ? m->swing_row : 1;
+    return m->swing_count[i] > MONITOR_LEAST_SWINGS && both > MONITOR_SWING
+               ? 1 + MONITOR_SWING_ROOM * (both - MONITOR_SWING)
+               : 1;
+}
+
+/* The largest likelihood ratio over all ages of one step or ramp, and its sign. */
+static REAL likelihood_ratio(const PREFIX_monitor *m, int shape, int *sign)
 {
     REAL flat = 0;
     REAL rising = 0;
@@ -223,8 +259,10 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
     REAL largest = 0;
     int back = 0;
     int age, i, j;
+    *sign = 1;
     for (age = 0; age < AGES; age++) {
         REAL fit;
+        int is_below;
         for (; back < monitor_ages[age]; back++) {
             const REAL *e = m->white + (m->at - back + OLDEST) % OLDEST * CHANNELS;
             REAL slope = 0;
@@ -242,10 +280,12 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
                 fit += monitor_early[shape * (ORDER + 1) + j][i] * e[i];
             }
         }
+        is_below = fit < 0;
         fit = beyond(fit * monitor_roots[shape][age], monitor_effects[shape][age]);
         fit = fit * fit;
         if (!(fit <= largest)) {
             largest = isnan(fit) ? (REAL)HUGE_VAL : fit;
+            *sign = is_below ? -1 : 1;
         }
     }
     return largest;
@@ -382,6 +422,7 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
         m->scores[i] = 0;
     }
     m->alarmed = 0;
+    monitor_calm(m);
 }
 
 /* The largest likelihood ratios over all ages of a change of each fault; return the one of which a change alone is more
@@ -446,6 +487,8 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     REAL ratio, statistic;
     REAL best = -1;
     REAL levels[MONITOR_STATISTICS];
+    REAL slow = 0;
+    REAL raised = 1;
     int changed = -1;
     int which = 0;
     int is_said = !is_gap;
@@ -453,7 +496,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     int is_partly = 0;
     int seen[CHANNELS];
     REAL most = (REAL)HUGE_VAL;
-    int known, i;
+    int known, sign, i, j;
     m->taken += m->taken <= MONITOR_SETTLING;
     m->decided = m->decided || deciding;
     for (i = 0; i < CHANNELS; i++) {
@@ -508,19 +551,30 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     if (known || (deciding && innovation >= 0 && m->taken > MONITOR_SETTLING)) {
         monitor_raise(m, levels);
         statistic = square(m->white + m->at * CHANNELS) / levels[0];
+        m->swing_row *= MONITOR_ROW_KEPT;
+        m->swing_row = isfinite(statistic) && statistic > m->swing_row ? statistic : m->swing_row;
         for (i = 0; i < MEANS; i++) {
             ratio = square(m->means + i * CHANNELS) * monitor_sizes[0][i] / levels[1 + i];
-            statistic = ratio <= statistic ? statistic : ratio;
+            slow = ratio <= slow ? slow : ratio;
+            for (j = 0; j < CHANNELS; j++) {
+                REAL mean = m->means[i * CHANNELS + j];
+                ratio = monitor_swing(m, i * CHANNELS + j, monitor_sizes[0][i] / levels[1 + i] * mean * ABS(mean));
+                raised = ratio > raised ? ratio : raised;
+            }
         }
         for (i = 0; i < SHAPES; i++) {
-            ratio = likelihood_ratio(m, i);
+            ratio = likelihood_ratio(m, i, &sign);
             if (ratio > best) {
                 best = ratio;
                 which = i;
             }
             ratio /= levels[1 + MEANS + i];
-            statistic = ratio <= statistic ? statistic : ratio;
+            slow = ratio <= slow ? slow : ratio;
+            ratio = monitor_swing(m, MEANS * CHANNELS + i, (REAL)sign * ratio);
+            raised = ratio > raised ? ratio : raised;
         }
+        slow /= raised;
+        statistic = slow <= statistic ? statistic : slow;
         changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
             REAL away = beyond(shown[i] - m->centres[i], monitor_bands[0][i]);

@@ -22,6 +22,7 @@ from obsynth.monitoring.thresholds.parameter_scores import (
     parameter_walk,
     sample_score,
 )
+from obsynth.monitoring.thresholds.swings import Swings
 from obsynth.monitoring.thresholds.watched_columns import (
     has_innovations_by_sensor,
     innovation_names,
@@ -66,6 +67,7 @@ class LearnedState(NamedTuple):
     own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults
     ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
     decided: int = 0  # whether a row has been decided: the warm-up is over
+    swings: Swings = Swings()  # of means of whitened rows, and of likelihood ratios, to both sides
 
 
 def follow_shares(memory: float) -> tuple[float, float]:
@@ -92,7 +94,9 @@ class LearnedRule(Rule):
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
     that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had.
-    """
+
+    Where means of whitened rows and likelihood ratios swing to both sides their levels rise by what they reach there:
+    the noise has become slower than it was, as a fault would stay on one side."""
 
     def __init__(
         self,
@@ -117,6 +121,7 @@ class LearnedRule(Rule):
         self._rests_on_the_past = self._model.rests_on_the_past
         offsets = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
         self._effects = offsets.ravel()
+        self._swinging = len(FORGETTING) * self._model.channels + len(templates)
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
         self._ranges = learned.ranges
@@ -132,6 +137,7 @@ class LearnedRule(Rule):
         state = LearnedState(
             np.tile(model.mean, (model.order, 1)), white, means, effects=effects, slow=np.zeros(model.channels),
             raised=np.ones((max(AGES), inputs)), own=np.zeros(model.channels + len(self._names)),
+            swings=Swings.none(self._swinging),
         )  # fmt: skip
         if self._walk is None:
             return state
@@ -190,15 +196,22 @@ class LearnedRule(Rule):
             return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
         with np.errstate(all="ignore"):
-            fits = np.maximum(np.abs(self._templates @ state.white.ravel()) - self._effects, 0.0)
-            ratios = (fits**2).reshape(-1, len(AGES)).max(axis=1)
+            ratios, sides = self._likelihood_ratios(state)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
-            first = [np.sum(state.white[-1] ** 2)]
+            first = [float(np.sum(state.white[-1] ** 2))]
             changes = self._changes(state, self._bands)
             squares = self._squares(state, sample.observation)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
-            values = values / (self.learned.levels * self._factors(state))
+            levels = self.learned.levels * self._factors(state)
+            slow = slice(1, 1 + len(smooth) + len(ratios))
+            of_means, of_ratios = np.split(levels[slow], [len(smooth)])
+            squared = (weights / of_means)[:, None] * state.means * np.abs(state.means)
+            swings, factor = state.swings.after(
+                np.concatenate([squared.ravel(), sides * ratios / of_ratios]), first[0] / levels[0], sample.time
+            )
+            levels[slow] *= factor
+            values, state = values / levels, state._replace(swings=swings)
         values = np.where(np.isnan(values), np.inf, values)
         state = self._own_of_start(state._replace(alarmed=int(values.max() > 1.0)), sample.observation, counts=counts)
         # Faults are compared without what their slow offsets explain: each has its own.
@@ -272,8 +285,16 @@ class LearnedRule(Rule):
         slow, centres = np.split(own / begun, [len(white)])
         return state._replace(
             slow=slow, centres=centres, white=np.zeros_like(state.white), means=np.zeros_like(state.means),
-            scores=np.zeros_like(state.scores), alarmed=0, ended=begun,
+            scores=np.zeros_like(state.scores), alarmed=0, ended=begun, swings=Swings.none(self._swinging),
         )  # fmt: skip
+
+    def _likelihood_ratios(self, state: LearnedState) -> tuple[FloatArray, FloatArray]:
+        """Return twice the log likelihood ratio of a step or ramp of each shape at its likeliest age, and its sign."""
+        fits = self._templates @ state.white.ravel()
+        squares = np.maximum(np.abs(fits) - self._effects, 0.0) ** 2
+        likeliest = np.argmax(squares.reshape(-1, len(AGES)), axis=1)
+        places = np.arange(len(likeliest)) * len(AGES) + likeliest
+        return squares[places], np.sign(fits[places])
 
     def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
         """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,
