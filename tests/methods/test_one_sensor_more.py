@@ -185,3 +185,61 @@ def test_a_noisy_sensor_more_costs_no_noise_at_a_stated_decay() -> None:
         spread = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
         deviations.append(float(np.sqrt((c @ spread @ c.T).item())))
     assert deviations[1] <= 1.001 * deviations[0]
+
+
+def _with_one_more(seed: int, dt: float) -> list[obsynth.DescriptorSystem]:
+    """Return a random plant of one fault with one sensor, and the same with a second one, each with its own noise."""
+    rng = np.random.default_rng([4801, seed])
+    a = rng.normal(size=(3, 3)) - 1.5 * np.eye(3)
+    a = scipy.linalg.expm(dt * a) if dt else a
+    c, bf, sensors = rng.normal(size=(2, 3)), rng.normal(size=(3, 1)), 10.0 ** rng.uniform(-2, 0, 2)
+    process = 0.1 * rng.normal(size=(3, 1))
+    return [
+        obsynth.DescriptorSystem(
+            A=a, C=c[:count], Bf=bf, Bw=np.hstack([process, np.zeros((3, count))]),
+            Dw=np.hstack([np.zeros((count, 1)), np.diag(sensors[:count])]), dt=dt,
+        )
+        for count in (1, 2)
+    ]  # fmt: skip
+
+
+def _deviation_behind_a_lag(design: obsynth.ObserverDesign, rate: float) -> float:
+    """Return that of the error of the fault, by its error system: the observer's own state less the plant's."""
+    plant, observer = design.linear
+    rows = observer.fault_rows
+    driven = np.vstack([plant.Bw, np.zeros((plant.nf, plant.nw))]) - observer.By @ plant.Dw
+    read, direct = observer.Cz[rows], observer.Dy[rows] @ plant.Dw
+    a = np.block([[observer.Az, np.zeros((observer.order, 1))], [rate * read, -rate * np.eye(1)]])
+    b = np.vstack([driven, -rate * direct])
+    return float(np.sqrt(scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)[-1, -1]))
+
+
+@pytest.mark.parametrize("seed", [1, 7])
+def test_one_sensor_more_costs_a_pd_observer_no_noise(seed: int) -> None:
+    plants = _with_one_more(seed, 0.0)
+    rate = float(np.max(np.abs(np.linalg.eigvals(plants[0].A))))
+    designs = [obsynth.pd_observer(plant, decay=0.3) for plant in plants]
+    alone, both = (_deviation_behind_a_lag(design, rate) for design in designs)
+    assert both <= 1.001 * alone
+    assert designs[1].report.passed
+    assert min(-np.max(np.linalg.eigvals(design.observer.Az).real) for design in designs) >= 0.3
+
+
+@pytest.mark.parametrize(("seed", "dt"), [(1, 0.0), (6, 0.2), (7, 0.0)])
+def test_one_sensor_more_costs_no_noise_at_given_poles(seed: int, dt: float) -> None:
+    poles = [np.exp(-dt * rate) if dt else -rate for rate in (3.0, 3.3, 3.6, 4.0)]
+    deviations = []
+    for plant in _with_one_more(seed, dt):
+        design = obsynth.ui_pi_observer(plant, poles=poles)
+        assert design.report.passed
+        observer = design.observer
+        whole = np.block([[plant.A, np.zeros((plant.nx, observer.order))], [observer.By @ plant.C, observer.Az]])
+        driven = np.vstack([plant.Bw, observer.By @ plant.Dw])
+        read = np.hstack([observer.Dy[observer.fault_rows] @ plant.C, observer.Cz[observer.fault_rows]])
+        direct = observer.Dy[observer.fault_rows] @ plant.Dw
+        if dt:
+            spread = scipy.linalg.solve_discrete_lyapunov(whole, driven @ driven.T)
+        else:
+            spread = scipy.linalg.solve_continuous_lyapunov(whole, -driven @ driven.T)
+        deviations.append(float((read @ spread @ read.T + (direct @ direct.T if dt else 0.0))[0, 0]) ** 0.5)
+    assert deviations[1] <= 1.001 * deviations[0]

@@ -49,7 +49,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
 from obsynth.verification.inequalities import stability_factor
 from obsynth.verification.seen_outputs import seen_plant
 from obsynth.verification.signals_from_rest import has_index_one
@@ -405,6 +405,12 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
     model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
+    if not model.missed() <= IDENTITY_SHARE:
+        raise SolverError(
+            "The numbers of the filter of least gain follow the plant by rounding only, as none of its outputs shows "
+            "its states by more: the result is inconclusive. Measure with noise (sensor_noise), give a longer delay or "
+            "a reference model of less bandwidth."
+        )
     missed = fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
     return follower, observer, missed
 

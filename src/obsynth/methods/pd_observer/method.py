@@ -36,6 +36,11 @@ class PdObserver(Method):
     The estimates of states and slowly varying faults converge to them from any start; what is left is the effect of
     the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
 
+    Where the plant states noise of its sensors and has up to ten unknown states, and nothing but a decay rate is asked
+    for, a sensor more never makes the fault estimates noisier at that rate: one that the smallest gains use badly is
+    left out, and a note names it.  Noisier is meant of the standard deviation of the fault errors, seen through a lag
+    as fast as the plant's fastest mode.
+
     Parameters
     ----------
     plant : DescriptorSystem or Transformation

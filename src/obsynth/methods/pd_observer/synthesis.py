@@ -20,6 +20,7 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.conditions.pd_inequalities import PdSolution, PdTask, solve
 from obsynth.errors import InfeasibleError, ObsynthError, SolverError
+from obsynth.methods.engines.fewer_sensors import error_deviation, left_out, with_fewer_sensors
 from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
@@ -33,6 +34,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import FAR_UNITS, PlantUnits
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.results.design import Certificate
+from obsynth.verification.error_system import ErrorModel
 
 #: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
 #: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
@@ -55,6 +57,9 @@ MANY_UNKNOWN_STATES = 100
 
 #: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
 HIDDEN_SHARE = 0.5
+
+#: With more unknown states the outputs are taken as they are: each choice of them takes the inequality again.
+MOST_UNKNOWNS_OF_CHOICES = 10
 
 #: Decay rates within this factor count as equal where outputs are merged or not.
 AS_FAST = 1.001
@@ -79,9 +84,33 @@ def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, 
     """Return the gains to ship and the records of all solver runs.
 
     Dependent outputs are merged; nearly dependent ones where that is as fast (with a stated ``decay``: reaches it) and
-    less noisy. Bounds on gains and noise are about the outputs as they are.
+    less noisy. Bounds on gains and noise are about the outputs as they are.  Where noise is stated, outputs that make
+    the estimates noisier are left out: the smallest gains do not see it.
     """
     as_they_are = method.gain_bound is not None or method.noise_gain is not None
+    first, records = _merged_if_quieter(plant, method, as_they_are=as_they_are)
+    unknowns = plant.nx + plant.nf
+    few = unknowns <= MOST_UNKNOWNS_OF_CHOICES and method.engines_for(unknowns)[0] == "lmi"
+    if method.further or method.adaptation_gain is not None or method.decay == 0.0 or not few:
+        return first, records
+    lag = fastest_shown_mode(plant)
+
+    def noise(candidate: PdGains) -> float:
+        return error_deviation(_error_model(plant, candidate), lag)
+
+    fewer = with_fewer_sensors(plant, lambda some: _of_merged(plant, method, some)[0], noise)
+    candidates = [first, *fewer]
+    rates = [-candidate.abscissa for candidate in candidates]
+    # A rate that is stated is reached by all; by default a faster one than the target was not asked for.
+    wanted = 0.0 if method.decay else min(_target(plant), max(rates)) / AS_FAST
+    # The first of those that are as quiet: with all outputs, where that is one of them.
+    return min((one for one, rate in zip(candidates, rates, strict=True) if rate >= wanted), key=noise), records
+
+
+def _merged_if_quieter(
+    plant: DescriptorSystem, method: PdObserver, *, as_they_are: bool
+) -> tuple[PdGains, list[Mapping[str, Any]]]:
+    """Return the gains with outputs merged that depend, or nearly depend, on others, and the records of all runs."""
     choices = [None] if as_they_are else [merged_outputs(plant), nearly_merged_outputs(plant)]
     first, records = _of_merged(plant, method, choices[0])
     for merged in choices[1:]:
@@ -124,8 +153,7 @@ def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdG
     records = [plain.record]
     if method.decay and has_objective and method.disk is None and method.noise_gain is None and plant.Dw.any():
         return _less_noisy(plant, method, plain)
-    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
-    target = float(min(DECAY_SHARE * fastest_shown_mode(plant), -HIDDEN_SHARE * slowest))
+    target = _target(plant)
     if not free or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
@@ -149,6 +177,18 @@ def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdG
         other = _faster(plant, method, in_given_units, target, records, own=False)
         gains = other if other.decay > gains.decay else gains
     return gains, records
+
+
+def _target(plant: DescriptorSystem) -> float:
+    """Return the rate (1/s) at which errors should decay by default."""
+    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
+    return float(min(DECAY_SHARE * fastest_shown_mode(plant), -HIDDEN_SHARE * slowest))
+
+
+def _error_model(plant: DescriptorSystem, gains: PdGains) -> ErrorModel:
+    """Return what gains follow: the plant with its faults as states."""
+    nf = plant.nf
+    return ErrorModel(plant, gains.observer, np.eye(plant.nx + nf), Phi=np.zeros((nf, nf)), Cw=np.eye(nf))
 
 
 def _less_noisy(plant: DescriptorSystem, method: PdObserver, plain: PdGains) -> tuple[PdGains, list[Mapping[str, Any]]]:
@@ -425,6 +465,11 @@ def notes(plant: DescriptorSystem, method: PdObserver, gains: PdGains) -> tuple[
             "much of it as is "
             "reachable with moderate gains; without it errors would decay more slowly. decay: 0 takes the smallest "
             "gains."
+        )
+    if unused := left_out(plant, gains.J, gains.L):
+        texts.append(
+            f"No use is made of {unused}: the gains found with all outputs let more of the stated noise into the fault "
+            "estimates."
         )
     texts += _engine_notes(method, gains, plant.nx + plant.nf)
     direct = gains.observer.Dy[gains.observer.fault_rows]

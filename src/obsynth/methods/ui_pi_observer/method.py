@@ -55,7 +55,9 @@ class UiPiObserver(Method):
         How faults run: ``"step"``, ``"ramp"``, ``"parabola"``, ``{"polynomial": order}``, ``{"sinusoid": rad/s}``,
         ``{"exponential": 1/s}``, ``{"Phi": ..., "Cw": ...}``, ``{"sum": [...]}``; one for all, or by fault name.
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
-        Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.
+        Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.  Where
+        the plant states noise of its sensors, outputs that make the fault estimates noisier (standard deviation of
+        their errors) with these poles are left out, and a note names them.
     decay : float, optional, 1/s
         The Kalman gain of the least prescribed rate (Anderson, Moore 1971) with which all movable poles decay at this
         rate or faster: a gain of the rate itself is faster, and noisier.  0 is the plain Kalman gain.
@@ -176,6 +178,11 @@ class UiPiObserver(Method):
     solver_options: SolverOptions = None
     constraints: OwnConstraints = None
     steady_error_limit: OpenUnitInterval = STEADY_ERROR
+
+    @property
+    def leaves_freedom_to_us(self) -> bool:
+        """Whether poles are given, and what they leave free is spent as the defaults have it."""
+        return self.poles is not None and self.objective == "conditioning" and self.G is None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

@@ -17,6 +17,7 @@ from obsynth.analysis.existence.sharepasand import Existence, existence
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
+from obsynth.methods.engines.fewer_sensors import error_deviation, left_out, with_fewer_sensors
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.engines.region import region_gain
 from obsynth.methods.engines.sensor_noise import fault_deviation
@@ -35,6 +36,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
+from obsynth.verification.error_system import ErrorModel
 
 #: Rates below this, in 1/s, are those of an observer that does not settle.
 SLOWEST = 1e-300
@@ -124,6 +126,9 @@ def synthesise(
     if method.decay is None and region is None and not as_they_are:
         merged, tried = _without_likeness(known, model, method, merged, weights)
     designed = working if merged is None else merged.plant
+    if method.leaves_freedom_to_us and not as_they_are:
+        merged, tried = _with_quietest_outputs(known, model, method, merged, tried)
+        designed = working if merged is None else merged.plant
     problem = (
         tried[0]
         if tried
@@ -144,13 +149,15 @@ def synthesise(
         gains = gains[0], gains[1] @ merged.weights, gains[2] @ merged.weights
     poles = None if placed_poles is None else np.array([*placed_poles, *problem.fixed_modes])
     synthesis = assembled(working, model, gains, poles, dict(claims), structured=not method.joint)
+    unused = left_out(working, *gains[1:]) if method.leaves_freedom_to_us else ""
+    more = (f"No use is made of {unused}: with all outputs the gains for these poles are noisier.",) if unused else ()
     return Synthesis(
         method.resolved(model, plant.fault_names),
         synthesis.gains,
         synthesis.observer,
         synthesis.certificate,
         {"runs": list(runs)},
-        tuple(notes(known, problem, method, synthesis.certificate.claims)),
+        (*notes(known, problem, method, synthesis.certificate.claims), *more),
         known.transformation,
     )
 
@@ -200,29 +207,69 @@ class _Compared(NamedTuple):
     result: tuple[PlacementProblem, Choice]
 
 
+def _with_quietest_outputs(
+    known: Existence,
+    model: Exosystem,
+    method: UiPiObserver,
+    merged: MergedOutputs | None,
+    tried: tuple[PlacementProblem, Choice] | None,
+) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
+    """Return which outputs to take for given poles, with the problem and its gain: of all choices, the least noisy.
+
+    Placement sees no noise: of the gains with these poles it takes well-conditioned ones, whatever a sensor adds."""
+
+    def designed(some: MergedOutputs) -> tuple[MergedOutputs, _Compared]:
+        alone = existence(some.plant, model)
+        require_all_conditions(alone.conditions)
+        compared = _compared(known, model, method, some, {}) if alone.transformation is None else None
+        if compared is None:
+            raise SolverError("Poles could not be placed with these outputs.")
+        return some, compared
+
+    fewer = [*with_fewer_sensors(known.plant, designed, lambda pair: pair[1].noise)]
+    quietest = min(fewer, key=lambda pair: pair[1].noise, default=None)
+    if quietest is None:
+        return merged, tried
+    own = _compared(known, model, method, merged, {}, chosen=tried)
+    if own is not None and own.noise <= quietest[1].noise:
+        return merged, own.result
+    return quietest[0], quietest[1].result
+
+
 def _compared(
-    known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+    known: Existence,
+    model: Exosystem,
+    method: UiPiObserver,
+    merged: MergedOutputs | None,
+    weights: Mapping[str, Any],
+    *,
+    chosen: tuple[PlacementProblem, Choice] | None = None,
 ) -> _Compared | None:
-    """Return what a choice of outputs to merge comes to; ``None`` where it has no gain."""
+    """Return what a choice of outputs comes to, for a gain that is ``chosen`` or looked for; ``None`` where it has no
+    gain."""
     try:
-        problem = placement_problem(
-            known.plant if merged is None else merged.plant,
-            model,
-            known.fixed_modes,
-            joint=method.joint,
-            paper_matrices=None,
-        )
-        chosen = _chosen(method, problem, None, weights, known.plant.dt)
+        problem, choice = chosen or _problem_and_choice(known, model, method, merged, weights)
     except (ObsynthError, np.linalg.LinAlgError):
         return None
-    U, D, K = problem.gains(chosen[0])
+    U, D, K = problem.gains(choice[0])
     means = np.eye(known.plant.ny) if merged is None else merged.weights
-    observer = assembled(
-        known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint
-    ).linear_observer
+    synthesis = assembled(known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint)
+    observer = synthesis.linear_observer
     poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
     settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
-    return _Compared(fault_deviation(known.plant, observer), settling, (problem, chosen))
+    noise = fault_deviation(known.plant, observer)
+    if method.leaves_freedom_to_us and known.plant.Dw.any():
+        tracking, phi, cw = (synthesis.certificate.matrices[name] for name in ("tracking", "Phi", "Cw"))
+        noise = error_deviation(ErrorModel(known.plant, observer, tracking, Phi=phi, Cw=cw, decoupled=True))
+    return _Compared(noise, settling, (problem, choice))
+
+
+def _problem_and_choice(
+    known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+) -> tuple[PlacementProblem, Choice]:
+    plant = known.plant if merged is None else merged.plant
+    problem = placement_problem(plant, model, known.fixed_modes, joint=method.joint, paper_matrices=None)
+    return problem, _chosen(method, problem, None, weights, known.plant.dt)
 
 
 def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str) -> Choice:

@@ -1,0 +1,104 @@
+"""Designs that leave sensors out, as candidates beside the one with all: a sensor more then costs no noise.
+
+An observer of fewer outputs is one of all with gains of zero.  An objective that does not see the noise, such as the
+size of gains or the conditioning of poles, may give it less noise than the design with all of them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from typing import TypeVar
+
+import numpy as np
+
+from obsynth.errors import ObsynthError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.transformations.redundant_outputs import MergedOutputs
+from obsynth.verification.error_system import ErrorModel
+
+#: Up to so many outputs every choice of them is tried; of more, those that leave one out, then one more while it helps.
+MOST_OUTPUTS = 3
+
+Candidate = TypeVar("Candidate")
+
+
+def some_outputs(plant: DescriptorSystem, places: tuple[int, ...]) -> MergedOutputs:
+    """Return the plant with some outputs alone."""
+    rows = {name: getattr(plant, name)[list(places)] for name in ("C", "D", "Df", "Dd", "Dw")}
+    alone = plant.replace(**rows, output_names=[plant.output_names[i] for i in places])
+    return MergedOutputs(alone, read_only(np.eye(plant.ny)[list(places)]), False)
+
+
+def with_fewer_sensors(
+    plant: DescriptorSystem, designed: Callable[[MergedOutputs], Candidate], noise: Callable[[Candidate], float]
+) -> Iterator[Candidate]:
+    """Yield designs for fewer outputs of a plant that states their noise; of none where it states none."""
+    if plant.ny < 2 or not plant.Dw.any():
+        return
+
+    def candidate(places: tuple[int, ...]) -> Candidate | None:
+        try:
+            with np.errstate(all="ignore"):
+                return designed(some_outputs(plant, places))
+        except (ObsynthError, np.linalg.LinAlgError):
+            return None  # those that are left out are needed
+
+    if plant.ny <= MOST_OUTPUTS:
+        choices = (places for count in range(1, plant.ny) for places in combinations(range(plant.ny), count))
+        yield from (one for places in choices if (one := candidate(places)) is not None)
+        return
+    left, best = tuple(range(plant.ny)), np.inf
+    while len(left) > 1:
+        fewer = [tuple(j for j in left if j != i) for i in left]
+        tried = [(others, one) for others in fewer if (one := candidate(others)) is not None]
+        yield from (one for _, one in tried)
+        quietest = min(tried, key=lambda pair: noise(pair[1]), default=None)
+        if quietest is None or not noise(quietest[1]) < best:
+            return
+        left, best = quietest[0], noise(quietest[1])
+
+
+def left_out(plant: DescriptorSystem, *gains: FloatArray) -> str:
+    """Return the outputs that show something and have gains of zero alone, in words; nothing where there are none."""
+    shows = np.any(np.hstack([plant.C, plant.Df]) != 0.0, axis=1)
+    unused = shows & ~np.any(np.vstack(gains) != 0.0, axis=0)
+    return ", ".join(name for name, is_unused in zip(plant.output_names, unused, strict=True) if is_unused)
+
+
+def error_deviation(model: ErrorModel, lag: float | None = None) -> float:
+    """Return the largest deviation of a fault estimate's error under the noise that the plant states, in units in which
+    faults act alike; of continuous time behind a ``lag`` (rate, 1/s), where what passes at once has a deviation too."""
+    plant, observer = model.plant, model.observer
+    c, _, _, direct = model.fault_output
+    places = [plant.fault_names.index(name) for name in observer.fault_names]
+    sizes = PlantUnits.of(plant).faults[places]
+    scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)[:, None]
+    a, b, c, d = model.Az, model.noise, -scale * c, scale * direct
+    if not observer.dt and lag is not None:
+        a, b, c, d = _behind_lag(a, b, c, d, lag)
+    poles = np.linalg.eigvals(a) if len(a) else np.zeros(0)
+    if not np.all(np.abs(poles) < 1.0 if observer.dt else poles.real < 0.0) or (not observer.dt and d.any()):
+        return np.inf
+    variances = np.sum(d * d, axis=1)
+    if len(a):
+        with warnings.catch_warnings(action="ignore"):
+            spread = discrete_lyapunov(a, b @ b.T) if observer.dt else continuous_lyapunov(a, -b @ b.T)
+        variances = variances + np.diag(c @ spread @ c.T)
+    return float(np.sqrt(np.max(np.maximum(variances, 0.0), initial=0.0)))
+
+
+def _behind_lag(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, lag: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    rows = len(c)
+    return (
+        np.block([[a, np.zeros((len(a), rows))], [lag * c, -lag * np.eye(rows)]]),
+        np.vstack([b, lag * d]),
+        np.hstack([np.zeros((rows, len(a))), np.eye(rows)]),
+        np.zeros_like(d),
+    )
