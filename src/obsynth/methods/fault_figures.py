@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.linear_recursions import impulse_responses
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
@@ -121,13 +122,8 @@ def step_responses(
     a = np.block([[moved, np.zeros((plant.nx, order))], [into, observer.Az]])
     b = np.vstack([inputs, observer.By @ direct])
     c = np.hstack([observer.Dy[rows] @ output_map - observer.Du[rows] @ gain, observer.Cz[rows]])
-    responses = np.empty((steps, len(c), b.shape[1]))
-    responses[0] = observer.Dy[rows] @ direct
-    state = b
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(1, steps):
-            responses[k] = c @ state
-            state = a @ state
+    first = observer.Dy[rows] @ direct
+    responses = np.concatenate([first[None], impulse_responses(a, b, c, steps - 1)])
     return responses, np.cumsum(responses[:, :, : plant.nf], axis=0)
 
 

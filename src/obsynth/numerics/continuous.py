@@ -172,13 +172,3 @@ def _in_like_sizes(a: FloatArray, inputs: FloatArray) -> tuple[FloatArray, Float
     # Large inputs would make the exponential square more often than the dynamics need.
     sizes = power_of_two_below(np.max(np.abs(scaled), axis=0, initial=0.0))
     return balanced, scale, scaled / sizes, sizes
-
-
-def driven(a: FloatArray, start: FloatArray, drive: FloatArray) -> FloatArray:
-    """Return ``x(0), x(1), ...`` of ``x+ = a x + drive (steps, ..., n)``; infinite where the states overflow."""
-    x, turned = np.empty_like(drive), np.ascontiguousarray(a.T)
-    x[:1] = start
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(len(drive) - 1):
-            x[k + 1] = x[k] @ turned + drive[k]
-    return x

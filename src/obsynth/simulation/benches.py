@@ -11,7 +11,8 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.continuous import driven, first_order_hold
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.numerics.linear_recursions import driven
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver

@@ -17,8 +17,9 @@ from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import arguments_checked, real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import driven, first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.libraries import failed_computations
+from obsynth.numerics.linear_recursions import driven
 from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem

@@ -18,7 +18,7 @@ from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import driven
+from obsynth.numerics.linear_recursions import driven
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve

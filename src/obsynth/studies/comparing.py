@@ -24,8 +24,8 @@ from obsynth.monitoring.logs.log_run import faults_on_rows
 from obsynth.monitoring.thresholds.residual_model import largest_disturbances
 from obsynth.numerics.arguments import Count, NonNegative, Positive, Probability, arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small
+from obsynth.numerics.linear_recursions import driven
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
