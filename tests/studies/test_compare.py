@@ -235,7 +235,7 @@ def test_bad_arguments(tmp_path: Path) -> None:
         obsynth.compare(plant, methods=["magic"])
     with pytest.raises(obsynth.SpecError, match="tolerance"):
         obsynth.compare(plant, tolerance=-1.0)
-    with pytest.raises(obsynth.SpecError, match="no column 'steer'"):
+    with pytest.raises(obsynth.SpecError, match="no columns 'steer', 'r', 'ay'"):
         obsynth.compare(plant, data=pd.DataFrame({"vy": [0.0]}), runs=1, methods=["functional-filter"])
     with pytest.raises(obsynth.SpecError, match="no faults"):
         obsynth.compare(plant.replace(Bf=None, Df=None, fault_names=None, units={}))
