@@ -37,6 +37,7 @@ def test_a_mode_that_one_point_hides_is_named_with_the_point(
     assert str(caught.value).startswith("No observer of this kind exists")
 
 
+@pytest.mark.long
 def test_points_where_an_entry_vanishes_are_looked_at_along_each_parameter_and_between_vertices() -> None:
     with pytest.raises(PreconditionError, match=r"at v = 0, w = 0\.5"):
         obsynth.descriptor_kalman(hidden("v", {"v": [-1, 2], "w": [0, 1]}, "2 + w"), Q=1.0, R=1.0)

@@ -86,6 +86,7 @@ def test_a_spec_as_the_file_of_a_calibration_names_the_option_for_it(folder, cap
     assert "--write-spec calibrated.yaml" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.long
 def test_a_calibration_can_be_made_again(folder, capsys):
     """Of one constant, which takes less time than four."""
     spec, kept = folder / "one.yaml", "  unknown: {a1: [0.005, 0.08]}"

@@ -52,6 +52,7 @@ def test_a_constraint_of_the_users_is_kept():
     assert np.trace(paper.variables["P"].value) <= bound * (1.0 + 1e-6)
 
 
+@pytest.mark.long
 def test_a_given_level_is_judged_as_before():
     plant = random_plant(6, nd=3, seed=3)
     least = np.sqrt(obsynth.conditions.wang2015(plant).problem.solve())

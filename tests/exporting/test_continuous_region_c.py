@@ -141,7 +141,7 @@ def watched_plant(seed: int) -> PolytopicSystem:
     [
         (2, 0.1, None, None),
         (3, 0.1, 0.5, 0.0),
-        (20, 0.05, 0.0, None),
+        pytest.param(20, 0.05, 0.0, None, marks=pytest.mark.long),
         *(pytest.param(s, 0.1, None, 0.0, marks=pytest.mark.long) for s in (8, 14, 22, 25, 26, 27)),
     ],
 )
@@ -175,8 +175,8 @@ def test_guaranteed_thresholds_in_c_follow_the_rows_as_in_a_run(
     ("seed", "h"),
     [
         (6, 0.3),
-        (7, 0.02),
-        (2, 2.0),
+        pytest.param(7, 0.02, marks=pytest.mark.long),
+        pytest.param(2, 2.0, marks=pytest.mark.long),
         *(pytest.param(s, 0.05 * s + 0.1, marks=pytest.mark.long) for s in (0, 1, 9, 14, 17)),
     ],
 )

@@ -82,6 +82,7 @@ def data(value: Any) -> dict[str, Any]:
     return as_data(np.atleast_2d(np.asarray(value, dtype=np.float64)))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_what_a_file_claims_is_proved_by_a_process_of_its_own(name: str, tmp_path: Path) -> None:
     assert [entry["claim"] for entry in file_of(name)["claims"]] == DESIGNS[name][3]

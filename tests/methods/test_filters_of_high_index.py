@@ -152,6 +152,7 @@ def test_a_long_delay_leaves_no_states_that_are_reached_by_rounding_only() -> No
     assert design.gain < design.least * (1 + 1e-6)
 
 
+@pytest.mark.long
 def test_modes_that_grow_and_that_no_input_drives_are_followed_where_outputs_are_of_high_index() -> None:
     design = obsynth.optimal_filter(scrambled(8, 3))
     assert design.report.passed

@@ -83,6 +83,7 @@ def test_no_course_exceeds_the_mean_square(name: str, request: pytest.FixtureReq
     assert 0.8 * level < worst <= level
 
 
+@pytest.mark.long
 def test_estimates_follow_without_noise(singular: ObserverDesign) -> None:
     plant, observer = singular.scheduled
     rng = np.random.default_rng(2)

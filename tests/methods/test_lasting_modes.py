@@ -41,6 +41,7 @@ def plant_and_filter(name: str) -> tuple[obsynth.DescriptorSystem, obsynth.Obser
     return plant, obsynth.optimal_filter(plant)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
     plant, design = plant_and_filter(name)
@@ -192,6 +193,7 @@ def test_errors_of_any_start_decay_beside_a_mode_that_grows() -> None:
     assert faults[-1, 0] < 1e-5 * np.max(faults) < 1e-7 * np.max(y)
 
 
+@pytest.mark.long
 def test_weights_reach_the_noise_beside_modes_that_last() -> None:
     """The weights were those of the plant with its drives, and did not fit the plant as it is."""
     plant = growing(1.0, 1.0)

@@ -67,6 +67,7 @@ def worst_of(test: obsynth.GuaranteedTest, plant: obsynth.DescriptorSystem, dt: 
     return noise + float(np.abs(responses(plant, dt, SAMPLES).reshape(SAMPLES * PARTS, -1) @ weights).sum())
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(8))
 def test_a_threshold_is_that_of_the_worst_course_between_samples(seed: int, tmp_path: Path) -> None:
     plant, dt = plant_of(seed)
@@ -180,6 +181,7 @@ def worst_record(test: obsynth.GuaranteedTest, plant: obsynth.DescriptorSystem, 
     return np.tensordot(course, effects, 1) + 3.0 * float(plant.Dw[0, 0]) * np.sign(weights)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", [1, 5, 6])
 def test_the_worst_record_is_no_alarm_no_proof_and_no_interval_without_zero(seed: int) -> None:
     plant, dt = plant_of(seed)

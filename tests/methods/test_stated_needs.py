@@ -45,6 +45,7 @@ BIASED = ob.DAEModel(
 NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("plant", "method", "options", "words"),
     [
@@ -69,6 +70,7 @@ def test_check_tells_what_is_not_stated(plant: Any, method: str, options: dict[s
         ob.design(plant, method, **options)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("plant", "method", "options"),
     [
@@ -86,6 +88,7 @@ def test_what_is_stated_is_enough(plant: Any, method: str, options: dict[str, An
     assert ob.design(plant, method, **options).report.passed
 
 
+@pytest.mark.long
 def test_large_plants_have_the_answer_of_a_design() -> None:
     # Of more than 60 states no gains were formed: the filter was said to exist.
     states = 61

@@ -283,6 +283,7 @@ def test_c_of_a_continuous_observer_is_refused(continuous: ObserverDesign, tmp_p
         obsynth.export(continuous, tmp_path / "region.c")
 
 
+@pytest.mark.long
 def test_units_do_not_matter() -> None:
     plain = obsynth.ui_pi_observer(sampled_plant()).certificate.claims
     plant = sampled_plant()
@@ -311,6 +312,7 @@ def test_what_does_not_exist_is_refused_by_name() -> None:
         obsynth.ui_pi_observer(blind)
 
 
+@pytest.mark.long
 def test_auto_takes_the_method_that_exists() -> None:
     found = obsynth.design(continuous_plant())
     assert found.method == "ui-pi-observer"

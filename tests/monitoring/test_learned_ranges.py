@@ -62,6 +62,7 @@ def test_one_log_says_before_a_run_that_it_does_not_show_drifts_of_the_plant() -
     assert "constants of the plant" not in replace(learned(), logs=3).statement
 
 
+@pytest.mark.long
 def test_levels_rise_beyond_the_range_by_what_the_logs_say_of_the_model_alone() -> None:
     """A model without an error that follows the input: rates are small, and a fault alarms beyond the range."""
     exact = obsynth.learn_thresholds(design(), log(0, 1.0, mismatch=0.0, rows=2000), false_alarms="1 per 200 rows")

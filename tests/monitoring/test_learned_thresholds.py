@@ -604,6 +604,7 @@ def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tm
     assert "an alarm comes at the onset of the fault or not at all. Give run a level for the estimate" in told
 
 
+@pytest.mark.long
 def test_an_alarm_is_not_ended_by_outputs_that_are_left_out() -> None:
     """A fault that throws sensors out of the gate of a Kalman filter: each row is decided, and the alarm stands."""
     plant = obsynth.TimeVaryingDescriptorSystem(

@@ -358,6 +358,7 @@ def test_a_stuck_sensor_is_told_by_validate() -> None:
     assert read_log(log(1), ["u"], ["ya", "yb"]).notes == ()
 
 
+@pytest.mark.long
 def test_an_estimate_that_is_not_watched_says_how_many_rows_it_needs_and_a_level_that_alarms() -> None:
     """One log of a motor: its residuals alarm at the onset of a fault or not at all, and no level was named."""
     plant = obsynth.DescriptorSystem(

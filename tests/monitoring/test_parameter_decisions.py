@@ -175,6 +175,7 @@ class TestSimulation:
             simulate_time_varying(printed(), samples=5, parameters=np.zeros((4, 1)))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("adapt", [{}, {"form": "literal"}, {"form": "random-walk", "walk": 1e-4 * np.eye(2)}])
 def test_a_start_far_from_nominal_is_no_alarm(adapt: dict) -> None:
     """The parameters are nominal, and the observer starts elsewhere: what is left of its initial-condition response

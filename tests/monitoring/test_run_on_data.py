@@ -138,6 +138,7 @@ def test_irregular_stamps_are_exact_for_signals_linear_between_rows(continuous):
     assert np.allclose(np.hstack([estimates(found, kind) for kind in ("xhat", "fhat", "r")]), wanted, atol=1e-9 * scale)
 
 
+@pytest.mark.long
 def test_regular_stamps_equal_sample_observer(continuous):
     """The same recursion in other coordinates: a start at rest of the one is z = -Gamma_1 v(0) of the other."""
     table = random_log(continuous, 0.05 * np.arange(200))

@@ -44,6 +44,7 @@ def test_a_log_of_the_plant_agrees_from_another_start_and_beside_disturbances() 
     assert not found[0].sensors["y2"].nis.samples
 
 
+@pytest.mark.long
 def test_noise_that_is_stated_too_small_is_named() -> None:
     design = obsynth.fault_estimation_filter(plant_with(noise=0.1 / 3.0))
     found = obsynth.validate(design, log_of(PLANT))
@@ -52,6 +53,7 @@ def test_noise_that_is_stated_too_small_is_named() -> None:
     assert any("y1" in text and "too small" in text for text in found.verdict)
 
 
+@pytest.mark.long
 def test_another_unit_is_the_only_reason() -> None:
     log = log_of(PLANT)
     log["y1"] *= 1000.0
@@ -61,6 +63,7 @@ def test_another_unit_is_the_only_reason() -> None:
     assert not any("white" in text or "offset" in text for text in found.verdict)
 
 
+@pytest.mark.long
 def test_what_is_not_white_is_named_with_its_period() -> None:
     log = log_of(PLANT)
     log["y1"] += 0.3 * np.sin(2.0 * np.pi * np.arange(ROWS) / 30.0)
@@ -90,6 +93,7 @@ def test_an_input_that_acts_later_is_named() -> None:
     assert "an input u1 that acts later" in found.verdict[-1]
 
 
+@pytest.mark.long
 def test_a_continuous_plant_is_compared_on_the_grid_of_the_log() -> None:
     plant = obsynth.DescriptorSystem(
         A=[[-0.5]], B=[[1.0]], C=[[1.0], [1.0]], Bf=[[1.0]], sensor_noise={"y1": 0.05, "y2": 0.1}

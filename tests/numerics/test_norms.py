@@ -171,6 +171,7 @@ class TestHinfNorm:
             true, _ = control.linfnorm(control.ss(*realisation, 1.0), tol=1e-12)
             check_encloses(hinf_norm(*realisation), true, slack=1e-9)
 
+    @pytest.mark.long
     def test_units_of_the_states_do_not_matter(self):
         """Without balancing, crossings were missed and the bound was 6e-6 too low."""
         rng = np.random.default_rng(4)

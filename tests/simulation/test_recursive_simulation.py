@@ -85,6 +85,7 @@ def test_the_observer_beside_it_is_that_of_run(varying) -> None:
     np.testing.assert_array_equal(found.parameter_errors, again.parameters - found.parameters)
 
 
+@pytest.mark.long
 def test_runs_at_once_are_runs_one_by_one(varying, shifted) -> None:
     cases = ((varying[0], varying[1].replace(horizon=80)), (shifted, obsynth.Scenario(horizon=40, noise=1)))
     for design, scenario in cases:

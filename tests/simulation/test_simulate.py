@@ -261,6 +261,7 @@ def test_sines_are_linear_between_samples() -> None:
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.05)
 
 
+@pytest.mark.long
 def test_the_audit_of_the_unknown_input_observer(sharepasand) -> None:
     design, scenario = sharepasand
     found = obsynth.simulate(design, scenario)

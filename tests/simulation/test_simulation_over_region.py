@@ -96,6 +96,7 @@ def test_a_scheduled_design_finds_the_fault_while_its_parameters_move() -> None:
     assert found is not None
 
 
+@pytest.mark.long
 def test_samples_faster_than_the_stated_rate_are_counted() -> None:
     design = obsynth.fault_estimation_filter(wang(rate=0.05))
     scenario = Scenario(horizon=200, scheduling={"a": obsynth.Step(size=1.0, start=80)})

@@ -33,6 +33,7 @@ def test_a_larger_region_costs_and_no_course_passes_the_claim() -> None:
     assert found.plot().get_xlabel() == "share of the region"
 
 
+@pytest.mark.long
 def test_a_slower_parameter_costs_less_and_any_course_stands_last() -> None:
     found = obsynth.region_trade_off(wang(0.6, rate=0.05), rates=[0.02, None], weight="paper")
     assert found.claims[0] < found.claims[1]
@@ -90,6 +91,7 @@ def test_regions_of_nonlinear_plants_and_of_vertices_shrink_about_their_middle()
     )
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("options", "told"),
     [

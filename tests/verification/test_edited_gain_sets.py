@@ -212,6 +212,7 @@ def asked(name: str) -> dict[str, Any]:
     return json.loads(json.dumps(design_as_dict(design)))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("name", "option", "edit"),
     [

@@ -173,6 +173,7 @@ def test_another_scheduling_of_the_observer_is_refused(design: ObserverDesign) -
         assert not obsynth.verify(with_observer(design, scheduling=changed))["scheduling"].passed
 
 
+@pytest.mark.long
 def test_an_effect_that_is_too_small_is_refused(scaled: ObserverDesign) -> None:
     assert scaled.report["effectiveness of the faults"].value == pytest.approx(2.0)
     gone = wang(effectiveness=True).as_dict()

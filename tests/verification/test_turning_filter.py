@@ -149,6 +149,7 @@ def test_a_gain_set_and_arrays_hold_the_correction(tmp_path: Path, design: Obser
     assert np.array_equal(np.moveaxis(np.load(file)["correction"], -1, 0), again.scheduled[1].correction)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_what_has_no_such_filter_is_refused_and_left_to_the_pi_observer() -> None:
     # Six equations in four columns of gains.
     two = turning_plant(
