@@ -326,6 +326,29 @@ class TestCovarianceFactor:
         assert caught.value.path == "Q(3)"
 
 
+@pytest.mark.parametrize("directions", [6, 4])
+@pytest.mark.parametrize("seed", range(6))
+def test_priors_far_from_each_other_keep_the_digits_of_accurate_sensors(seed: int, directions: int) -> None:
+    """States known to 1e-6 and to 3e8 at first, equations without noise, four sensors of 1e-4: parity is all prior but
+    for one part in 1e12. With four directions some equations have no noise of their own."""
+    rng = np.random.default_rng([52, seed])
+    A, C = rng.standard_normal((6, 6)), rng.standard_normal((4, 6))
+    prior = np.diag(10.0 ** rng.uniform(-6.0, 8.5, 6))
+    prior[:, directions:] = 0.0
+    case = Case(np.eye(6), A, C, np.zeros((6, 6)), 1e-8 * np.eye(4), prior**2, steps=1, seed=seed)
+    mean, covariance = reference(case)
+    S = np.zeros((10, 10))
+    S[:6, :6], S[6:, 6:] = A @ np.sqrt(case.P0), 1e-4 * np.eye(4)
+    data = np.concatenate([case.drive[0], case.y[0]])[:, None]
+    found = rank_revealing_step(case.H, S, data, np.zeros((10, 0)))
+    deviations = np.sqrt(np.diag(covariance))
+    # So many deviations are the data away from the model, or its gains are off by one part in as many.
+    far = max(1.0, float(np.max(np.abs(mean) / deviations)))
+    assert np.max(np.abs(found.estimate[:, 0] - mean) / deviations) < 1e-11 * far
+    gap = found.factor @ found.factor.T - covariance
+    assert np.max(np.abs(gap) / np.outer(deviations, deviations)) < 1e-9
+
+
 @pytest.mark.parametrize("parity", [0, 7])
 def test_noise_that_stays_may_be_a_triangle(parity) -> None:
     rng = np.random.default_rng(parity)

@@ -57,6 +57,10 @@ SENSOR_SHARE = RANK_TOLERANCE
 WORTH_FORGETTING = 0.1
 
 
+#: A factorisation with pivoting, see `_largest_first`.
+_Factored = tuple[FloatArray, NDArray[np.intp], FloatArray, NDArray[np.intp]]
+
+
 class LeastSquaresStep(NamedTuple):
     """``estimate (n, columns)``, ``P = factor factor'``, the whitened parity ``innovation (m, columns)``, and
 
@@ -238,21 +242,24 @@ def rank_revealing_step(
 
 
 def _independent_noise(S: FloatArray) -> FloatArray:
-    """Return a root of the covariance of ``S (rows, any)`` with no more columns than it has independent directions.
+    """Return a root of the covariance of ``S (rows, any)`` whose columns are not more than it has independent
+    directions, unless these are as many as the rows.
 
     Columns that depend on the others would leave as many of rounding in what comes after, and a later step, in which
-    nothing else is left, would take these for noise."""
+    nothing else is left, would take these for noise. Where every row has noise of its own, nothing passes for noise,
+    and to replace the columns would only round what large ones have in common: a few of 1e9 beside those of sensors
+    of 1e-4."""
     if not S.size:
         return S
     sizes = np.linalg.norm(S, axis=1, keepdims=True)
     sizes[sizes == 0.0] = 1.0
-    _, triangle, order = _pivoted((S / sizes).T)
-    rank = int(np.sum(np.abs(np.diagonal(triangle)) > PERFECT_PARITY))
-    if rank == S.shape[1]:
+    packed, order, _ = _largest_first((S / sizes).T)[:3]
+    rank = int(np.sum(np.abs(np.diagonal(packed)) > PERFECT_PARITY))
+    if rank in S.shape:
         return S
-    compact = np.empty((len(S), rank))
-    compact[order] = triangle[:rank].T
-    return np.asarray(compact * sizes)
+    # Which rows are independent does not depend on their units; digits of small columns do.
+    packed, _, tau, first = _largest_first(S[order[:rank]].T)
+    return np.ascontiguousarray(_rotated(packed, tau, S.T[first])[:rank].T)
 
 
 def _square(root: FloatArray) -> FloatArray:
@@ -282,11 +289,12 @@ def _least_rounding(
 def _by_columns(
     H: FloatArray, unknown: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the lengths of the columns of ``[H -unknown]``, and of these columns at length one: bases of their range
-    and of what is beside it, the triangle ``(rank, rank)`` with the columns that it is of, and the null space."""
+    """Return the lengths of the columns of ``[H -unknown]`` as powers of two, and of these columns at length one to
+    two: bases of their range and of what is beside it, the triangle ``(rank, rank)`` with the columns that it is of,
+    and the null space."""
     joined = np.hstack([H, -unknown])
-    lengths = np.sqrt(np.einsum("ij,ij->j", joined, joined))
-    lengths[lengths == 0.0] = 1.0
+    # By other numbers each entry would be rounded: beside states of 1e11 more than what their sensors resolve.
+    lengths = power_of_two_below(np.sqrt(np.einsum("ij,ij->j", joined, joined)))
     q, r, order = _pivoted(joined / lengths)
     sizes = np.abs(np.diagonal(r))
     rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
@@ -298,13 +306,33 @@ def _by_columns(
     return lengths, q[:, :rank], q[:, rank:], head, order[:rank], null
 
 
-def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp], int]:
-    """Return the sizes ``(rows, 1)`` of the noise in parity, and of that at size one: an orthogonal matrix, a triangle,
-    the order of rows, and how many of them hold noise."""
+def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, _Factored, int]:
+    """Return the sizes ``(rows, 1)`` of the noise in parity, of that at size one `_largest_first`, and how many of its
+    rows hold noise."""
     sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
     sizes[sizes == 0.0] = 1.0
-    turned, triangle, order = _pivoted((q2.T @ S / sizes[:, None]).T)
-    return sizes[:, None], turned, triangle, order, int(np.sum(np.abs(np.diagonal(triangle)) > PERFECT_PARITY))
+    factored = _largest_first((q2.T @ S / sizes[:, None]).T)
+    return sizes[:, None], factored, int(np.sum(np.abs(np.diagonal(factored[0])) > PERFECT_PARITY))
+
+
+def _largest_first(matrix: FloatArray) -> _Factored:
+    """Return the QR factorisation of ``matrix (rows, any)`` with pivoting, as LAPACK packs it, the order of columns,
+    the factors of the reflections, and the order of rows in which these are: the largest first.
+
+    In this order, with pivoting, each row is rounded beside itself (Cox and Higham 1998): rows that are sources of
+    noise may be far from each other."""
+    first = np.argsort(-np.max(np.abs(matrix), axis=1, initial=0.0), kind="stable")
+    if not matrix.size:
+        return matrix, np.arange(matrix.shape[1]), np.zeros(0), first
+    packed, order, tau, _, _ = lapack.dgeqp3(_finite(matrix[first]), lwork=WORK * (matrix.shape[1] + 1))
+    return packed, order - 1, tau, first
+
+
+def _rotated(packed: FloatArray, tau: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Return ``Q' matrix`` by the reflections one after another: Q itself holds large rows only beside one."""
+    if not (tau.size and matrix.size):
+        return matrix
+    return np.asarray(lapack.dormqr("L", "T", packed[:, : len(tau)], tau, matrix, WORK * matrix.shape[1])[0])
 
 
 def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
@@ -313,10 +341,17 @@ def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.int
     if not matrix.size:
         return np.eye(rows), np.empty_like(matrix), np.arange(columns)
     packed, order, tau, _, _ = lapack.dgeqp3(_finite(matrix), lwork=WORK * (columns + 1))
-    reflections = min(rows, columns)
+    return _formed(packed, tau), np.triu(packed), order - 1
+
+
+def _formed(packed: FloatArray, tau: FloatArray) -> FloatArray:
+    """Return Q ``(rows, rows)`` of a factorisation as LAPACK packs it."""
+    rows, reflections = len(packed), len(tau)
+    if not reflections:
+        return np.eye(rows)
     q = np.empty((rows, rows), order="F")
     q[:, :reflections] = packed[:, :reflections]
-    return lapack.dorgqr(q, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
+    return np.asarray(lapack.dorgqr(q, tau, lwork=WORK * rows, overwrite_a=1)[0])
 
 
 def _triangle(matrix: FloatArray) -> FloatArray:
@@ -358,7 +393,8 @@ def _whitened(
     data = q2.T @ Y
     if not q2.shape[1]:
         return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S, data
-    sizes, z, t, order, rank = _parity(q2, S)
+    sizes, (packed, order, tau, first), rank = _parity(q2, S)
+    t = np.triu(packed)
     scaled = (data / sizes)[order]
     lower = t[:rank, :rank].T
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
@@ -366,7 +402,7 @@ def _whitened(
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     made_of = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
     _require_vanishing(remainder[:, mapped : mapped + terms.shape[1]], made_of, mapped)
-    rotated = q1.T @ S @ z
+    rotated = _rotated(packed, tau, (S.T @ q1)[first]).T
     signs = np.sign(np.diagonal(lower))[:, None]
     return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:], remainder
 
@@ -502,7 +538,9 @@ def _fixed_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[
     """Return what the parity says of some directions of e, an orthogonal matrix that has these first, their number."""
     if not q2.shape[1]:
         return np.zeros((0, right.shape[1])), np.eye(S.shape[1]), 0
-    sizes, turned, t, order, count = _parity(q2, S)
+    sizes, (packed, order, tau, first), count = _parity(q2, S)
+    t, turned = np.triu(packed), np.empty((S.shape[1], S.shape[1]))
+    turned[first] = _formed(packed, tau)
     data = (q2.T @ right / sizes)[order][:count]
     return (-_substituted(t[:count, :count].T, data, lower=True) if count else data), turned, count
 
