@@ -349,6 +349,32 @@ def test_priors_far_from_each_other_keep_the_digits_of_accurate_sensors(seed: in
     assert np.max(np.abs(gap) / np.outer(deviations, deviations)) < 1e-9
 
 
+@pytest.mark.parametrize("seed", [6, 8, 10])
+def test_the_step_without_decisions_keeps_them_too(seed: int) -> None:
+    rng = np.random.default_rng([52, seed])
+    A, C = rng.standard_normal((6, 6)), rng.standard_normal((4, 6))
+    prior = np.diag(10.0 ** rng.uniform(-6.0, 7.0, 6))
+    case = Case(np.eye(6), A, C, np.zeros((6, 6)), 1e-8 * np.eye(4), prior**2, steps=1, seed=seed)
+    mean, covariance = reference(case)
+    S = np.zeros((10, 10))
+    S[:6, :6], S[6:, 6:] = A @ prior, 1e-4 * np.eye(4)
+    data = np.concatenate([case.drive[0], case.y[0]])[:, None]
+    projection, deviations = projection_of(case.H), np.sqrt(np.diag(covariance))
+    assert projection is not None
+    # Larger plants keep the noise of the step as a triangle.
+    known = S.copy()
+    known[:6, :6] = 0.0
+    rotated = projection.rotation @ np.vstack([S[:6], np.zeros((4, 10))])
+    triangle = noise_triangle((projection.rotation @ known).T)
+    for found in (
+        least_squares_step(case.H, S, data),
+        projected_step(projection, rotated.T.copy(order="F"), projection.rotation @ data, known=triangle),
+    ):
+        assert found is not None
+        gap = np.abs(found.estimate[:, 0] - mean) / deviations
+        assert np.max(gap) < 1e-12 * max(1.0, float(np.max(np.abs(mean) / deviations)))
+
+
 @pytest.mark.parametrize("parity", [0, 7])
 def test_noise_that_stays_may_be_a_triangle(parity) -> None:
     rng = np.random.default_rng(parity)

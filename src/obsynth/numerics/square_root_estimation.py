@@ -37,6 +37,9 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
 
+#: The same below which sources of noise are factorised the largest first: as many digits are lost otherwise.
+FAR_PARITY = 1e-8
+
 #: Rows of H that differ by no more than this in size cost a factorisation no digits.
 FAR_ROWS = 256.0
 
@@ -149,9 +152,12 @@ def projected_step(
         return None
     suspect = SUSPECT_PARITY * math.sqrt(squares)
     if known is None:
-        triangle = lapack.dgeqrf(noise, overwrite_a=1)[0]
+        triangle = lapack.dgeqrf(noise)[0]
     else:
-        triangle = lapack.dtpqrt(0, min(TPQRT_BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
+        triangle = lapack.dtpqrt(0, min(TPQRT_BLOCK, rows), known, np.asfortranarray(noise))[0]
+    if m and min(map(abs, triangle.diagonal()[:m].tolist())) <= FAR_PARITY * math.sqrt(squares):
+        sources = noise if known is None else np.concatenate((known, noise))
+        triangle = lapack.dgeqrf(sources[_largest_rows(sources)])[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]
     if m:
@@ -321,11 +327,16 @@ def _largest_first(matrix: FloatArray) -> _Factored:
 
     In this order, with pivoting, each row is rounded beside itself (Cox and Higham 1998): rows that are sources of
     noise may be far from each other."""
-    first = np.argsort(-np.max(np.abs(matrix), axis=1, initial=0.0), kind="stable")
+    first = _largest_rows(matrix)
     if not matrix.size:
         return matrix, np.arange(matrix.shape[1]), np.zeros(0), first
     packed, order, tau, _, _ = lapack.dgeqp3(_finite(matrix[first]), lwork=WORK * (matrix.shape[1] + 1))
     return packed, order - 1, tau, first
+
+
+def _largest_rows(matrix: FloatArray) -> NDArray[np.intp]:
+    """Return the order of rows in which the largest are first."""
+    return np.argsort(-np.max(np.abs(matrix), axis=1, initial=0.0), kind="stable")
 
 
 def _rotated(packed: FloatArray, tau: FloatArray, matrix: FloatArray) -> FloatArray:
