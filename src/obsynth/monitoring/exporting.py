@@ -12,7 +12,7 @@ from obsynth.exporting.alarms import STATISTIC, ExportedMonitor, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
 from obsynth.monitoring.region_monitors import region_monitor_in_c
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
-from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, FOLLOWED_ROWS, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, OWN_MOST, LearnedRule, follow_shares
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
@@ -96,7 +96,7 @@ class LearnedMonitorInC:
             f"    long equal[{max(self.outputs, 1)}];",
             f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
             f"    REAL raised_now[{max(inputs, 1)}];",
-            "    int at, quiet, to_wait, alarmed, begun;",
+            "    int at, quiet, to_wait, alarmed, begun, ended;",
             "    long taken;",
             "    int decided;",
             f"}} {prefix}_monitor;",
@@ -160,8 +160,10 @@ class LearnedMonitorInC:
     def _follow_numbers(self) -> dict[str, float]:
         """Return how an offset of residuals is followed, and how levels follow swings, by the names in C."""
         usual, in_alarm = follow_shares(self.learned.memory)
+        later, later_in_alarm = follow_shares(self.learned.memory or FOLLOWED_ROWS)
         return {
             "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
+            "MONITOR_FOLLOW_LATER": later, "MONITOR_FOLLOW_LATER_IN_ALARM": later_in_alarm,
             "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
             "MONITOR_SWING": SWING, "MONITOR_LEAST_SWINGS": LEAST_SWINGS, "MONITOR_SWING_ROOM": SWING_ROOM,
             "MONITOR_SWING_KEPT": 1.0 - 1.0 / SWING_MEMORY, "MONITOR_ROW_KEPT": 1.0 - 1.0 / ROW_MEMORY,

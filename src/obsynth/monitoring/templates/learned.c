@@ -42,7 +42,7 @@ static void monitor_reset(PREFIX_monitor *m)
         m->own[i] = 0;
     }
     monitor_calm(m);
-    m->begun = 0;
+    m->begun = m->ended = 0;
     for (i = 0; i < MONITOR_OUTPUTS; i++) {
         m->repeated[i] = 0;
         m->equal[i] = 0;
@@ -164,6 +164,15 @@ static void monitor_complete(const PREFIX_monitor *m, const int *seen, REAL *x)
     }
 }
 
+/* By which share of a row offsets follow it: also those that a start was taken for, and more slowly in an alarm. */
+static REAL monitor_share(const PREFIX_monitor *m)
+{
+    if (m->ended) {
+        return m->alarmed ? MONITOR_FOLLOW_LATER_IN_ALARM : MONITOR_FOLLOW_LATER;
+    }
+    return m->alarmed ? MONITOR_FOLLOW_IN_ALARM : MONITOR_FOLLOW;
+}
+
 /* Take a row of what is watched, whose evidence has a norm of `most` at most; `x` is NULL for one as predicted, and
  * `kept` is what later rows are predicted from. */
 static void monitor_add(PREFIX_monitor *m, const REAL *x, const REAL *kept, REAL most)
@@ -192,7 +201,7 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x, const REAL *kept, REAL
         e[i] = away;
         away = away > MONITOR_FOLLOWED_MOST ? MONITOR_FOLLOWED_MOST : away;
         away = away < -MONITOR_FOLLOWED_MOST ? -MONITOR_FOLLOWED_MOST : away;
-        m->slow[i] += (m->alarmed ? MONITOR_FOLLOW_IN_ALARM : MONITOR_FOLLOW) * (isnan(away) ? 0 : away);
+        m->slow[i] += monitor_share(m) * (isnan(away) ? 0 : away);
     }
     for (k = 0; k < MEANS; k++) {
         for (i = 0; i < CHANNELS; i++) {
@@ -370,14 +379,14 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
 static void monitor_centre(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
 {
     int i;
-    for (i = 0; MONITOR_FOLLOW > 0 && covariance != NULL && i < MONITOR_ESTIMATES; i++) {
+    for (i = 0; monitor_share(m) > 0 && covariance != NULL && i < MONITOR_ESTIMATES; i++) {
         REAL deviation = (REAL)sqrt(covariance[i * (MONITOR_WIDTH + 1)]);
         REAL away = (theta[i] - m->centres[i]) / deviation;
         REAL moved;
         away = away > MONITOR_FOLLOWED_MOST ? MONITOR_FOLLOWED_MOST : away;
         away = away < -MONITOR_FOLLOWED_MOST ? -MONITOR_FOLLOWED_MOST : away;
         moved = m->centres[i]
-            + (m->alarmed ? MONITOR_FOLLOW_IN_ALARM : MONITOR_FOLLOW) / MONITOR_FAULTS_SLOWER * away * deviation;
+            + monitor_share(m) / MONITOR_FAULTS_SLOWER * away * deviation;
         m->centres[i] = isfinite(moved) ? moved : m->centres[i];
     }
 }
@@ -422,6 +431,7 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
         m->scores[i] = 0;
     }
     m->alarmed = 0;
+    m->ended = 1;
     monitor_calm(m);
 }
 

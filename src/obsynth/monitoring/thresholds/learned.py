@@ -56,6 +56,12 @@ LOGS_FOR_OFFSETS = 3
 OWN_ROWS = (100, 200)
 
 
+#: Rows over which offsets of residuals are followed where one log does not tell them from drifts, and in a run whose
+#: first rows were taken for what is usual, of which they are an estimate: half as many again as the oldest change that
+#: statistics look for, of which three quarters remain.
+FOLLOWED_ROWS = 1.5 * max(AGES)
+
+
 class WrongPairs(NamedTuple):
     """Pairs of wrong samples in a row that count as not measured, as each of them would be an alarm."""
 
@@ -241,10 +247,11 @@ class LearnedThresholds:
             )
         if self.takes_first_rows:
             few = "one log does" if self.logs == 1 else f"{self.logs} logs do"
+            later = "" if self.memory else f", and followed over {FOLLOWED_ROWS:.6g} rows from then on"
             yield (
                 f"{few} not distinguish a fault that is there from the first row of a run on from an offset of that "
                 f"log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends there, as the "
-                "means of these rows are taken for what is usual in this log"
+                f"means of these rows are taken for what is usual in this log{later}"
             )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)

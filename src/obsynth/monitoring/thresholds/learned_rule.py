@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
 from obsynth.monitoring.thresholds.hypotheses import ranked_changes
-from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, OWN_ROWS, LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, FOLLOWED_ROWS, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.parameter_scores import (
@@ -93,7 +93,8 @@ class LearnedRule(Rule):
 
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
-    that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had.
+    that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had,
+    and are followed from then on.
 
     Where means of whitened rows and likelihood ratios swing to both sides their levels rise by what they reach there:
     the noise has become slower than it was, as a fault would stay on one side."""
@@ -125,7 +126,7 @@ class LearnedRule(Rule):
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
         self._ranges = learned.ranges
-        self._shares = follow_shares(learned.memory)
+        self._shares = follow_shares(learned.memory), follow_shares(learned.memory or FOLLOWED_ROWS)
         self._has_offset = learned.memory > 0.0 or learned.takes_first_rows
 
     def init(self) -> LearnedState:
@@ -261,14 +262,19 @@ class LearnedRule(Rule):
         newest_scores = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
         return state._replace(before=before, scores=newest_scores)
 
+    def _share(self, state: LearnedState) -> float:
+        """Return by which share of a row offsets follow it: also those that a start was taken for."""
+        return self._shares[int(state.ended > 0)][state.alarmed]
+
     def _centred(self, state: LearnedState, observation: Any) -> LearnedState:
         """Return the state whose centres of the faults have followed the estimates."""
-        if self._walk is None or not self._shares[0] or not isinstance(observation, Evidence):
+        share = self._share(state)
+        if self._walk is None or not share or not isinstance(observation, Evidence):
             return state
         deviations = np.sqrt(np.diag(observation.parameter_covariance))
         with np.errstate(all="ignore"):
             away = np.clip((observation.theta - state.centres) / deviations, -FOLLOWED_MOST, FOLLOWED_MOST)
-            moved = state.centres + self._shares[state.alarmed] / FAULTS_SLOWER * away * deviations
+            moved = state.centres + share / FAULTS_SLOWER * away * deviations
         return state._replace(centres=np.where(np.isfinite(moved), moved, state.centres))
 
     def _own_of_start(self, state: LearnedState, observation: Any, *, counts: bool) -> LearnedState:
@@ -365,7 +371,7 @@ class LearnedRule(Rule):
         if self._has_offset and evidence is not None and most:
             e = e - slow
             # A wrong sample moves the offset no more than noise does.
-            slow = slow + self._shares[state.alarmed] * np.clip(np.nan_to_num(e), -FOLLOWED_MOST, FOLLOWED_MOST)
+            slow = slow + self._share(state) * np.clip(np.nan_to_num(e), -FOLLOWED_MOST, FOLLOWED_MOST)
         shares = np.array(FORGETTING)[:, None]
         past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
         means = (1.0 - shares) * state.means + shares * e

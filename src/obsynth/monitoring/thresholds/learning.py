@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.sources import Logs
 from obsynth.monitoring.thresholds.alarm_rates import rows_per_alarm
-from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned import FOLLOWED_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_from_rows import (
     divided_at_starts,
     left_out_estimates,
@@ -21,7 +21,6 @@ from obsynth.monitoring.thresholds.learned_from_rows import (
     watched_rows,
 )
 from obsynth.monitoring.thresholds.learned_ranges import LearnedRanges, ranges_of_rows
-from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.normal_logs import NormalLogs, read_normal_logs
 from obsynth.monitoring.thresholds.normal_notes import (
     notes_of_left_out,
@@ -48,10 +47,6 @@ from obsynth.results.design import ObserverDesign
 
 #: One false alarm in so many rows, where nothing else is asked for.
 FALSE_ALARM_RATE = "1 per 1000 rows"
-
-#: Rows over which offsets of residuals are followed where one log does not tell them from drifts: half as many again as
-#: the oldest change that statistics look for, of which three quarters remain.
-FOLLOWED_ROWS = 1.5 * max(AGES)
 
 #: Deviations of its noise by which each sensor may drift, where nothing else is asked for.
 SENSOR_DRIFT = 0.0
