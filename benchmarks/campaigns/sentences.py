@@ -165,7 +165,8 @@ def _evaluate(
     sentences: Sentences, plant: WrittenPlant, design: ob.ObserverDesign, folder: Path, rng: np.random.Generator
 ) -> None:
     """Bounds of estimates of the exact model, and the least of all tests."""
-    pattern = rf"\|estimate of f1\| <= {NUMBER}(?:, {NUMBER} times the optimum of all tests .*? \({NUMBER}\))?"
+    beside = rf"(?:, {NUMBER} times the optimum of all|: less than any) tests? .*? \({NUMBER}\)"
+    pattern = rf"\|estimate of f1\| <= {NUMBER}(?:{beside})?"
     for told, found in sentences.paragraphs(pattern):
         sentences.expect("bound of an estimate", told, EXACT, "noise within 3 standard deviations")
         moving, fixed = MOVING in told, bool(HELD.search(told))

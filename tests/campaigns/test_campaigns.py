@@ -19,8 +19,8 @@ LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers", "switched_re
 LONG_PARTS = {
     ("adaptive_thresholds", 1), ("adaptive_thresholds", 2), ("chain_plants", 1), ("mutated_files", 3),
     ("random_tolerances", 2), ("recursive_existence", 0), ("regions", 1), ("regions", 3), ("sentences", 2),
-    ("static_and_chains", 1), ("static_and_chains", 2), ("static_and_chains", 3), ("tampered_claims", 0),
-    ("tampered_claims", 3),
+    ("sentences_of_pages", 0), ("sentences_of_pages", 1), ("static_and_chains", 1), ("static_and_chains", 2),
+    ("static_and_chains", 3), ("tampered_claims", 0), ("tampered_claims", 3),
 }  # fmt: skip
 #: Name and part of each share.
 SHARES = [

@@ -381,7 +381,7 @@ def test_a_default_walk_waits_twice_as_long_until_a_step_shows(seed: int, times:
     plant = obsynth.DescriptorSystem(**{name: given.given[name] for name in ("E", "A", "C", "Bf", "Df", "Bd", "Dd")},
                                      dt=given.dt)  # fmt: skip
     note = next(note for note in obsynth.functional_filter(plant).notes if "slowest with which" in note)
-    waited = float(note.split(" after ")[1].split()[0])
+    waited = float(note.split(" after ")[1].split()[0].replace(",", ""))
     assert waited == pytest.approx(times * settling_time(plant), rel=5e-3)
 
 

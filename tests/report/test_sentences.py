@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import expm
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.plants.constants import constants_box, shown
 from obsynth.report.headline import headline
 from obsynth.report.summary import summary
+from obsynth.studies.least_thresholds import in_words
 from obsynth.verification.assumptions import Assumptions
+
+DESIGNS = Path(__file__).parents[2] / "designs"
 
 #: An auditor signs no more words than this.
 MOST_WORDS = 75
@@ -143,6 +149,9 @@ def test_every_assumption_has_its_part_in_the_digest_and_in_the_words() -> None:
     assert "at y1" not in Assumptions(driven, **asked).phrase()
     assert shown(5.0) == "5"
     assert shown(0.25, "m") == "0.25 m"
+    sampled = plant.replace(Dw=np.zeros((2, 0)), Bw=np.zeros((2, 0)), noise_names=None)
+    (bound, *_) = Assumptions(sampled, bounds=np.array([11.693517472388132, 1.0]), noise_bound=0.0).parts()
+    assert bound.startswith("d1 within 11.6935, ")
     assert shown(1e15) == "1000000000000000.0"
 
 
@@ -202,3 +211,56 @@ def test_the_time_of_the_slowest_mode_is_not_called_that_of_the_response() -> No
     slowest = np.max(np.linalg.eigvals(observer.Az).real)
     assert np.exp(slowest * float(found.group(1))) == pytest.approx(0.02, rel=0.2)
     assert "settling time" not in text
+
+
+@pytest.mark.parametrize("between", [0.01, 0.002])
+def test_noise_of_a_continuous_design_is_that_of_a_rate_of_readings(between: float) -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[-1.0, 2.0], [0.0, -1.0]], C=np.eye(2), Bf=[[1.0], [0.0]], Bd=[[0.0], [1.0]],
+        sensor_noise={"y1": 0.1, "y2": 0.2},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant, decay=2.0)
+    line = " ".join(headline(design, None))
+    found = re.search(r"f1: ([\d.]+) exceeds 5 standard deviations of the noise if the sensors are read once a second, "
+                      r"sqrt\(T\) of it if every T seconds", line)  # fmt: skip
+    assert found is not None, line
+    observer, rows = design.linear[1], design.linear[1].fault_rows
+    assert not observer.Dy[rows].any()
+    n = observer.order
+    whole = expm(np.block([[observer.Az, observer.By], [np.zeros((2, n + 2))]]) * between)
+    driven = whole[:n, n:] * [0.1, 0.2]
+    states, power = np.zeros((n, n)), driven
+    for _ in range(round(12.0 / between)):
+        states, power = states + power @ power.T, whole[:n, :n] @ power
+    deviation = np.sqrt((observer.Cz[rows] @ states @ observer.Cz[rows].T).item())
+    assert 5.0 * deviation == pytest.approx(float(found.group(1)) * np.sqrt(between), rel=0.02)
+
+
+def test_runs_that_are_all_alike_are_called_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = DESIGNS / "filasova" / "spec.yaml"
+    gains = tmp_path / "gains.json"
+    assert main(["design", "--system", str(spec), "--output", str(gains), "--quiet"]) == 0
+    words = ["evaluate", "--system", str(spec), "--gains", str(gains), "--quiet", "--monitor", "pointwise"]
+    assert main([*words, "--runs", "2"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "All runs are the same" in text
+    found = re.search(r"Its threshold \((\S+) at the end of a run\)", text)
+    assert found is not None
+    # Rounding of residuals from numbers of size one is more than that.
+    assert float(found.group(1)) > np.finfo(float).eps
+
+
+def test_what_cannot_be_estimated_has_no_delay() -> None:
+    plant = obsynth.load_spec(DESIGNS / "drive" / "guaranteed_test.yaml").plant
+    diagnosis = obsynth.diagnose(plant)
+    (row,) = diagnosis.verdict_rows()[1:]
+    assert row[3:6] == ("no", "no", "-")
+    assert not any("the estimate needs" in sentence for sentence in diagnosis.sentences)
+
+
+def test_a_bound_below_the_least_of_tests_is_not_called_a_part_of_an_optimum() -> None:
+    """Tests use a window; an observer with a longer memory may do better."""
+    longer = in_words("f1", 0.6, 0.75, "W", samples=32)
+    assert "less than any test with its delay on at most 32 samples of inputs and outputs has (0.75 W)" in longer
+    assert "times" not in longer
+    assert "2.00 times the optimum of all tests" in in_words("f1", 1.5, 0.75, "W", samples=32)

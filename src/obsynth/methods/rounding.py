@@ -19,6 +19,7 @@ from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.results.layout import number
 from obsynth.verification.constant_faults import STEADY_ERROR
 
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
@@ -80,8 +81,9 @@ def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) ->
         if share >= TOLD_STEADY_ROUNDING:
             yield (
                 f"While {name!r} is constant, rounding as the observer runs in double precision may move its estimate "
-                f"by about {share:.2g} of the fault (every rounding at its worst, to first order): what is proved of "
-                "the estimate in the end is for exact arithmetic. Compare with another method (obsynth.compare)."
+                f"by about {number(share, digits=2)} times the fault (every rounding at its worst, to first order): "
+                "what is proved of the estimate in the end is for exact arithmetic. Compare with another method "
+                "(obsynth.compare)."
             )
 
 

@@ -51,6 +51,11 @@ def _rounded(value: float, way: str) -> float:
     return float(Context(RANGE_DIGITS, way).create_decimal(repr(float(value))))
 
 
+def shown_bound(value: float, unit: str = "") -> str:
+    """Return a bound in the digits of a text, rounded down: what holds for a bound holds for a lower one."""
+    return shown(_rounded(value, ROUND_FLOOR), unit)
+
+
 def deviations_told(count: float) -> str:
     """Return so many standard deviations in words, rounded down: what holds for a bound holds for a lower one."""
     return f"{shown(_rounded(count, ROUND_FLOOR))} standard deviation{'' if count == 1 else 's'}"

@@ -83,7 +83,7 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
         return list(registered("robustness")(design).facts())
     except PreconditionError as error:
         # The design is one for the nominal plant whatever the box may be.
-        return [("bounds", f"none: {error}")]
+        return [("bounds", f"none. {error}")]
 
 
 def plant_facts(
@@ -218,7 +218,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
         return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     linear = design.linear[1]
-    none, noise = "by sampling" if plant.nw else "-", "deviation" if plant.is_discrete else "deviation, 1 s"
+    none, noise = "by sampling" if plant.nw else "-", "deviation" if plant.is_discrete else "deviation at 1 sample/s"
     delays = ("delay", "delay in s") if plant.is_discrete else ()
     rows: list[tuple[str, ...]] = []
     for name, lag, disturbance_gains in zip(

@@ -14,7 +14,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed, noise_words
 from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear, is_of_held_disturbances
-from obsynth.results.layout import duration, number
+from obsynth.results.layout import duration, number, upper_number
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
@@ -84,7 +84,7 @@ def _of_test(test: GuaranteedTest) -> Iterator[str]:
     """Yield what a guaranteed test detects: its numbers are proved."""
     if len(test.tests) > 1:
         for own in test.tests:
-            size = _size(own.threshold, test.plant.units.get(own.fault, ""))
+            size = _bound(own.threshold, test.plant.units.get(own.fault, ""))
             yield f"{own.fault}: estimated within {size}, proved."
         return
     unit = test.plant.units.get(test.fault, "")
@@ -92,7 +92,7 @@ def _of_test(test: GuaranteedTest) -> Iterator[str]:
     soon = f", at the latest after {duration(claims['delay'])}" if "delay" in claims else ""
     sure = claims.get("surely_found", 2.0 * test.threshold)
     yield (
-        f"{test.fault}: {_size(sure, unit)} is certain to be detected{soon}; no false alarm while disturbances and "
+        f"{test.fault}: {_bound(sure, unit)} is certain to be detected{soon}; no false alarm while disturbances and "
         "noise keep their bounds (proved)."
     )
 
@@ -104,15 +104,18 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
     noise = noise_words(names) if is_noise_assumed(names) else "the noise"
     steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
     units = design.plant.units
+    timed = not isinstance(observer, LinearObserver) or observer.dt > 0.0
     held = ", if it is held between samples" if is_of_held_disturbances(design) else ""
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""
         sentence = f"{name}: "
         deviation = figures["deviation"]
         if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
+            # In continuous time noise has an intensity: that of the stated deviations, once a second.
+            read = "" if timed else " if the sensors are read once a second, sqrt(T) of it if every T seconds"
             sentence += (
-                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise} (false "
-                f"alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
+                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise}{read} "
+                f"(false alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
             )
         else:
             sentence += "no sensor noise is stated, so that no smallest size is known"
@@ -125,10 +128,15 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
             source = figures["largest_gain_from"]
             sentence += (
                 f"; a sine of amplitude {_size(1.0, units.get(source, ''))} in {source} moves the estimate by up to "
-                f"{_size(gain, unit)}{held}"
+                f"{_bound(gain, unit)}{held}"
             )
         yield f"{sentence}."
 
 
 def _size(value: float, unit: str) -> str:
     return f"{number(value, digits=3)} {'' if unit == '1' else unit}".strip()
+
+
+def _bound(value: float, unit: str) -> str:
+    """Return a size that is a bound: what is printed is one as well."""
+    return f"{upper_number(value)} {'' if unit == '1' else unit}".strip()

@@ -186,9 +186,14 @@ def in_words(
         return f"{own}. The smallest possible threshold is not known."
     if least <= SAME_RESPONSE * bound:
         return f"{own}. A test immune to disturbances and noise exists (guaranteed-test)."
+    if bound < least:
+        return (
+            f"{own}: less than any test with its delay on at most {samples} samples of inputs and outputs has "
+            f"({least:.4g}{f' {unit}' if unit else ''}), as the observer remembers more of them."
+        )
     return (
         f"{own}, {bound / least:.2f} times the optimum of all tests with its delay on at most {samples} "
-        f"samples of inputs and outputs ({least:.4g})."
+        f"samples of inputs and outputs ({least:.4g}{f' {unit}' if unit else ''})."
     )
 
 

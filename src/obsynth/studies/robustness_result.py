@@ -190,7 +190,7 @@ class Robustness:
         if self.sharing:
             yield "never distinguished from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
         if self.reason:
-            yield "bounds", f"none: {self.reason}"
+            yield "bounds", f"none. {self.reason}"
         if self.loop_radius is None:
             return
         ever = ": bounds stay finite for ever" if self.finite_for_ever else ": bounds hold at each sample, but may grow"

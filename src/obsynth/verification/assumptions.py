@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.constants import MOST_LISTED, ConstantsBox, deviations_told, shown
+from obsynth.plants.constants import MOST_LISTED, ConstantsBox, deviations_told, shown, shown_bound
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import continuous_behind
 from obsynth.plants.uncertainty import SAMPLED
@@ -79,7 +79,7 @@ class Assumptions:
         """Return one phrase for each kind of bound."""
         phrases, plant = [], self.plant
         each = [
-            f"{name} within {shown(bound, plant.units.get(name, ''))}"
+            f"{name} within {shown_bound(bound, plant.units.get(name, ''))}"
             for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)
             if np.isfinite(bound)  # others reach nothing that is watched
         ]

@@ -332,7 +332,7 @@ def _warnings(plant: DescriptorSystem, faults: Sequence[DecoupledFault]) -> tupl
     if thin:
         worst = min(thin, key=lambda fault: fault.gap)
         texts.append(
-            f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.1e} only; orders, "
+            f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.2g} only; orders, "
             "and in the worst case a verdict, may depend on the last digits of the data."
         )
     return tuple(texts)

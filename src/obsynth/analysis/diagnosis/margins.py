@@ -69,7 +69,7 @@ class Margins:
         kind = "a step" if self.at_rest[fault] else f"a sinusoid at {self.frequency:.3g} rad/s"
         text = (
             f"{names[fault]}: nearly lost. {kind.capitalize()} of one looks like {lookalikes}, but for "
-            f"{1.0 / margin:.1e} of its effect: it has to be {margin:.2g} times as large to be distinguished from the "
+            f"{1.0 / margin:.2g} of its effect: it has to be {margin:.2g} times as large to be distinguished from the "
             "others as to be seen."
         )
         if self.least_steps is None or not self.at_rest[fault]:

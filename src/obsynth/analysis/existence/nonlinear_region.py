@@ -52,7 +52,7 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         value=1.0,
     )
     if region is None:
-        text = "there is none: give ranges of the signals (option region)"
+        text = "give ranges of the signals (option region)"
         yield _of_the_form("region stated", "the region is stated", text)
         return
     bounded = "every nonlinearity has a bounded slope over the region"

@@ -43,6 +43,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.results.design import Certificate
+from obsynth.results.layout import duration
 from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 
@@ -293,12 +294,12 @@ def _notes(
         )
         notes.append(
             f"fault_rate was not given: a random-walk intensity of {largest:.3g} {unit} is the slowest with which a "
-            f"step is estimated after {seconds:.3g} s{close}. A delay reduces the noise only relative to a fault_rate "
-            "that you state."
+            f"step is estimated after {duration(seconds)}{close}. A delay reduces the noise only relative to a "
+            "fault_rate that you state."
         )
     if np.isfinite(slowest) and slowest * SLOW_ERRORS * settling_time(plant) < 1.0:
         notes.append(
-            f"The slowest pole has a time constant of {1.0 / slowest:.3g} s: initial errors of the state last that "
-            "long in the estimates. State decay= for a faster one, which has more noise."
+            f"The slowest pole has a time constant of {duration(1.0 / slowest)}: initial errors of the state last "
+            "that long in the estimates. State decay= for a faster one, which has more noise."
         )
     return notes

@@ -149,9 +149,15 @@ def _chosen_monitor(
         return None
     if isinstance(design.observer, LinearObserver):
         return monitor(design, scenario, options.monitor, **monitor_settings(design, options))
-    refuse_idle(
-        {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}, options.monitor, stated_settings(options), called=flag_of
-    )
+    kinds = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
+    del kinds["learned"]
+    if options.monitor not in kinds:
+        raise SpecError(
+            f"The monitor {options.monitor!r} is not for a recursive or nonlinear design: use one of "
+            f"{', '.join(sorted(kinds))}.",
+            path="--monitor",
+        )
+    refuse_idle(kinds, options.monitor, stated_settings(options), called=flag_of)
     return ParameterMonitor(
         options.monitor,
         false_alarms=options.false_alarms or FALSE_ALARMS,
