@@ -83,7 +83,7 @@ REFUSED: dict[str, tuple[Rows, dict[str, str]]] = {
     "two points": (with_cell("1.2.3"), {"*": NO_NUMBER.format("1.2.3")}),
     "unit in a cell": (with_cell("12 V"), {"*": NO_NUMBER.format("12 V")}),
     "empty output": (with_cell("", rows=ALL), {
-        "*": "'T1' is never measured. Name the column that holds it (--map T1=COLUMN)",
+        "*": "'T1' is never measured. Name the column that holds it (--map T1=COLUMN, or columns={'T1': 'COLUMN'})",
         "thresholds": f"Only 0 rows of the log can be used*Of its {ROWS} rows these are missing: T1 in {ROWS}.",
         "validate": "The output 'T1' is nowhere finite*--map T1=", "calibrate": "The output 'T1' is nowhere finite"}),
     "infinite output": (with_cell("inf", rows=ALL), {
@@ -246,7 +246,7 @@ def test_a_log_with_what_can_be_read_is_taken_and_what_is_missing_is_said(
 def test_files_of_other_kinds_are_refused_in_the_same_sentences(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
-    log, wanted = tmp_path / f"log.{kind}", "'T1' is never measured. Name the column that holds it (--map T1=COLUMN)"
+    log, wanted = tmp_path / f"log.{kind}", "'T1' is never measured. Name the column that holds it (--map T1=COLUMN, "
     table = pd.DataFrame([map(float, row) for row in clean()[1:]], columns=list(HEADER)).assign(T1=np.nan)
     if kind == "parquet":
         pytest.importorskip("pyarrow")

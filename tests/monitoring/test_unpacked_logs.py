@@ -158,7 +158,7 @@ def test_remarks_before_the_header_are_passed_over_and_told(design, frame, tmp_p
     assert log_table(path, ["level"])[1] == list(frame.columns)
     # What names no column anywhere is told by its own first line.
     path.write_text("a,b\n1,2\n3,4\n", encoding="utf-8")
-    with pytest.raises(SpecError, match=r"no column .*they have 'a', 'b'"):
+    with pytest.raises(SpecError, match=r"no columns .*they have 'a', 'b'"):
         obsynth.run_on_data(design, path)
 
 

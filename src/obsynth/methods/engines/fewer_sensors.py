@@ -24,6 +24,9 @@ from obsynth.verification.error_system import ErrorModel
 #: Up to so many outputs every choice of them is tried; of more, those that leave one out, then one more while it helps.
 MOST_OUTPUTS = 3
 
+#: No sensor is left out for less noise than this factor: it is there for more than the noise.
+AS_QUIET = 1.01
+
 Candidate = TypeVar("Candidate")
 
 

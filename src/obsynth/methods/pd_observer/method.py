@@ -37,9 +37,9 @@ class PdObserver(Method):
     the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
 
     Where the plant states noise of its sensors and has up to ten unknown states, and nothing but a decay rate is asked
-    for, a sensor more never makes the fault estimates noisier at that rate: one that the smallest gains use badly is
-    left out, and a note names it.  Noisier is meant of the standard deviation of the fault errors, seen through a lag
-    as fast as the plant's fastest mode.
+    for, a sensor more never makes the fault estimates noisier at that rate (by more than 1 %): one that the smallest
+    gains use badly is left out, and a note names it.  Noisier is meant of the standard deviation of the fault errors,
+    seen through a lag as fast as the plant's fastest mode.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.conditions.pd_inequalities import PdSolution, PdTask, solve
 from obsynth.errors import InfeasibleError, ObsynthError, SolverError
-from obsynth.methods.engines.fewer_sensors import error_deviation, left_out, with_fewer_sensors
+from obsynth.methods.engines.fewer_sensors import AS_QUIET, error_deviation, left_out, with_fewer_sensors
 from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
@@ -103,8 +103,10 @@ def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, 
     rates = [-candidate.abscissa for candidate in candidates]
     # A rate that is stated is reached by all; by default a faster one than the target was not asked for.
     wanted = 0.0 if method.decay else min(_target(plant), max(rates)) / AS_FAST
+    deviations = [noise(one) if rate >= wanted else np.inf for one, rate in zip(candidates, rates, strict=True)]
     # The first of those that are as quiet: with all outputs, where that is one of them.
-    return min((one for one, rate in zip(candidates, rates, strict=True) if rate >= wanted), key=noise), records
+    quiet = next(i for i, deviation in enumerate(deviations) if deviation <= AS_QUIET * min(deviations))
+    return candidates[quiet], records
 
 
 def _merged_if_quieter(

@@ -57,7 +57,7 @@ class UiPiObserver(Method):
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
         Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.  Where
         the plant states noise of its sensors, outputs that make the fault estimates noisier (standard deviation of
-        their errors) with these poles are left out, and a note names them.
+        their errors, by more than 1 %) with these poles are left out, and a note names them.
     decay : float, optional, 1/s
         The Kalman gain of the least prescribed rate (Anderson, Moore 1971) with which all movable poles decay at this
         rate or faster: a gain of the rate itself is faster, and noisier.  0 is the plain Kalman gain.

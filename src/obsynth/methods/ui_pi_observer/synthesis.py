@@ -17,7 +17,7 @@ from obsynth.analysis.existence.sharepasand import Existence, existence
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
-from obsynth.methods.engines.fewer_sensors import error_deviation, left_out, with_fewer_sensors
+from obsynth.methods.engines.fewer_sensors import AS_QUIET, error_deviation, left_out, with_fewer_sensors
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.engines.region import region_gain
 from obsynth.methods.engines.sensor_noise import fault_deviation
@@ -231,7 +231,7 @@ def _with_quietest_outputs(
     if quietest is None:
         return merged, tried
     own = _compared(known, model, method, merged, {}, chosen=tried)
-    if own is not None and own.noise <= quietest[1].noise:
+    if own is not None and own.noise <= AS_QUIET * quietest[1].noise:
         return merged, own.result
     return quietest[0], quietest[1].result
 

@@ -27,8 +27,8 @@ LEAST_SWINGS = 2.0
 SWING_MEMORY, ROW_MEMORY = 1_500.0, 100.0
 
 #: Levels rise by so many times what is reached on both sides beyond `SWING`.  In noise to which as much is added that
-#: follows itself by .9, 8 % of the rows after the 400th were in alarm with twice what is reached (`SWING` and all), 2 %
-#: with this.
+#: follows itself by .9, 8 % of the rows after the 400th were in alarm with twice what is reached (`SWING` and all) and
+#: 2 % with this, before single rows limited the rise.
 SWING_ROOM = 4.0
 
 #: A rise by this factor and more is told: changes that are found are 1.4 times as large then.
