@@ -408,8 +408,8 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
     if not model.missed() <= IDENTITY_SHARE:
         raise SolverError(
             "The numbers of the filter of least gain follow the plant by rounding only, as none of its outputs shows "
-            "its states by more: the result is inconclusive. Measure with noise (sensor_noise), give a longer delay or "
-            "a reference model of less bandwidth."
+            f"its states by more: the result is inconclusive. Take norm: {'hinf' if norm == 'h2' else 'h2'}, or a "
+            "reference model of a hundredth of the bandwidth: either gave a filter where this was seen."
         )
     missed = fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
     return follower, observer, missed
