@@ -78,6 +78,14 @@ class Sentences:
         self.wrong.append(f"{name}: {text}")
 
 
+def options_of(method: str, plant: WrittenPlant) -> dict[str, Any]:
+    """Return the options that a method is designed with."""
+    if method != "guaranteed-test":
+        return {}
+    limits = dict(zip(plant.names["d"], plant.bounds.tolist(), strict=True))
+    return {"course": "step", "before": 3, "after": 4, "noise_bound": 3, "disturbance_bounds": limits}
+
+
 def case(seed: int) -> Outcome:
     """Run one command on one plant and read what it prints."""
     rng = np.random.default_rng([seed, 46, 56])
@@ -87,10 +95,7 @@ def case(seed: int) -> Outcome:
 def of_plant(seed: int, plant: WrittenPlant, rng: np.random.Generator) -> Outcome:
     """Run the command of a seed with its method on a plant, and read what it prints."""
     method, command = METHODS[seed % len(METHODS)], COMMANDS[seed // len(METHODS) % len(COMMANDS)]
-    options: dict[str, Any] = {}
-    if method == "guaranteed-test":
-        limits = dict(zip(plant.names["d"], plant.bounds.tolist(), strict=True))
-        options = {"course": "step", "before": 3, "after": 4, "noise_bound": 3, "disturbance_bounds": limits}
+    options = options_of(method, plant)
     with TemporaryDirectory() as name:
         folder = Path(name)
         spec = plant.save(folder / "spec.yaml", method, options, AMPLITUDE)

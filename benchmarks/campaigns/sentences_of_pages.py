@@ -18,7 +18,6 @@ from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from benchmarks.campaigns import _printed_claims as printed
@@ -31,7 +30,7 @@ from benchmarks.campaigns._written_plants import (
     written_plant,
 )
 from benchmarks.campaigns.frame import Outcome
-from benchmarks.campaigns.sentences import NUMBER, Sentences
+from benchmarks.campaigns.sentences import NUMBER, Sentences, options_of
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.optimize import linprog
 
@@ -57,13 +56,9 @@ def case(seed: int) -> Outcome:
     methods = [(name, True) for name in ON_SAMPLES] + [(name, False) for name in IN_TIME]
     method, is_sampled = methods[seed % len(methods)]
     group = f"{method}{'' if is_sampled else ', continuous'}"
-    options: dict[str, Any] = {}
-    if method == "guaranteed-test":
-        limits = dict(zip(plant.names["d"], plant.bounds.tolist(), strict=True))
-        options = {"course": "step", "before": 3, "after": 4, "noise_bound": 3, "disturbance_bounds": limits}
     with TemporaryDirectory() as name:
         folder = Path(name)
-        spec = plant.spec(method, options, 0.5)
+        spec = plant.spec(method, options_of(method, plant), 0.5)
         if not is_sampled:
             del spec["plant"]["transform"]
             spec["scenario"]["sample_time"] = plant.dt

@@ -62,7 +62,7 @@ def truncations(model: Model, order: int, target: Target) -> list[Model]:
 
 
 def plainly_truncated(model: Model, order: int, *, discrete: bool) -> Model:
-    """Return a stable model's balanced truncation."""
+    """Return a stable model's balanced truncation; of all states that which is left without those of rounding."""
     return _projected(model, *_factors(model, discrete=discrete), order)
 
 

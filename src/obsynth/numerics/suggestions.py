@@ -46,8 +46,12 @@ def shortened(name: str) -> str:
 
 def quoted_names(names: Sequence[str]) -> str:
     """Return names in quotation marks with commas between, long ones shortened, and of many how many more there are."""
-    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return f"{', '.join(repr(shortened(name)) for name in names[:MOST_LISTED]) or 'none'}{more}"
+    return _listed([repr(shortened(name)) for name in names])
+
+
+def _listed(words: Sequence[str]) -> str:
+    more = f" and {len(words) - MOST_LISTED} more" if len(words) > MOST_LISTED else ""
+    return f"{', '.join(words[:MOST_LISTED]) or 'none'}{more}"
 
 
 def are_numbers(names: Sequence[str]) -> bool:
@@ -66,8 +70,7 @@ def _is_number(text: str) -> bool:
 def there_are(name: Any, names: Iterable[Any]) -> str:
     """Return the end of a message: which names there are, and the ones that may be meant by a wrong one."""
     known = list(map(str, names))
-    more = f" and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
-    return f"there are: {', '.join(map(shortened, known[:MOST_LISTED])) or 'none'}{more}.{suggestion(str(name), known)}"
+    return f"there are: {_listed([shortened(other) for other in known])}.{suggestion(str(name), known)}"
 
 
 def _closest(name: str, known: Sequence[str]) -> list[str]:

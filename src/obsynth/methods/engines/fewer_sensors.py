@@ -6,7 +6,6 @@ size of gains or the conditioning of poles, may give it less noise than the desi
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from itertools import combinations
 from typing import TypeVar
@@ -15,11 +14,8 @@ import numpy as np
 
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs
-from obsynth.verification.error_system import ErrorModel
 
 #: Up to so many outputs every choice of them is tried; of more, those that leave one out, then one more while it helps.
 MOST_OUTPUTS = 3
@@ -71,37 +67,3 @@ def left_out(plant: DescriptorSystem, *gains: FloatArray) -> str:
     shows = np.any(np.hstack([plant.C, plant.Df]) != 0.0, axis=1)
     unused = shows & ~np.any(np.vstack(gains) != 0.0, axis=0)
     return ", ".join(name for name, is_unused in zip(plant.output_names, unused, strict=True) if is_unused)
-
-
-def error_deviation(model: ErrorModel, lag: float | None = None) -> float:
-    """Return the largest deviation of a fault estimate's error under the noise that the plant states, in units in which
-    faults act alike; of continuous time behind a ``lag`` (rate, 1/s), where what passes at once has a deviation too."""
-    plant, observer = model.plant, model.observer
-    c, _, _, direct = model.fault_output
-    places = [plant.fault_names.index(name) for name in observer.fault_names]
-    sizes = PlantUnits.of(plant).faults[places]
-    scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    a, b, c, d = model.Az, model.noise, -scale * c, scale * direct
-    if not observer.dt and lag is not None:
-        a, b, c, d = _behind_lag(a, b, c, d, lag)
-    poles = np.linalg.eigvals(a) if len(a) else np.zeros(0)
-    if not np.all(np.abs(poles) < 1.0 if observer.dt else poles.real < 0.0) or (not observer.dt and d.any()):
-        return np.inf
-    variances = np.sum(d * d, axis=1)
-    if len(a):
-        with warnings.catch_warnings(action="ignore"):
-            spread = discrete_lyapunov(a, b @ b.T) if observer.dt else continuous_lyapunov(a, -b @ b.T)
-        variances = variances + np.diag(c @ spread @ c.T)
-    return float(np.sqrt(np.max(np.maximum(variances, 0.0), initial=0.0)))
-
-
-def _behind_lag(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, lag: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    rows = len(c)
-    return (
-        np.block([[a, np.zeros((len(a), rows))], [lag * c, -lag * np.eye(rows)]]),
-        np.vstack([b, lag * d]),
-        np.hstack([np.zeros((rows, len(a))), np.eye(rows)]),
-        np.zeros_like(d),
-    )

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.gramians import gramian_factor
-from obsynth.numerics.ranks import HANKEL_SHARE, RANK_TOLERANCE
+from obsynth.numerics.low_order_models import plainly_truncated
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
@@ -113,13 +113,8 @@ def _without_rounding(filter_: Model) -> Model:
 
 def _without_small_responses(filter_: Model) -> Model:
     """Return a sampled filter in balanced states, without those whose Hankel singular value is rounding."""
-    a, b, c, d = filter_
-    reached, read = gramian_factor(a, b), gramian_factor(a.T, c.T)
-    left, values, right = np.linalg.svd(read.T @ reached, full_matrices=False)
-    own = values > HANKEL_SHARE * np.max(values, initial=0.0)
-    roots = np.sqrt(values[own])
-    into, out = read @ left[:, own] / roots, reached @ right[own].T / roots
-    return _cleaned(into.T @ a @ out), _cleaned(into.T @ b), _cleaned(c @ out), d
+    a, b, c, d = plainly_truncated(filter_, len(filter_[0]), discrete=True)
+    return _cleaned(a), _cleaned(b), _cleaned(c), d
 
 
 def _balanced(filter_: Model) -> Model:

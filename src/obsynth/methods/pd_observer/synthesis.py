@@ -20,8 +20,8 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.conditions.pd_inequalities import PdSolution, PdTask, solve
 from obsynth.errors import InfeasibleError, ObsynthError, SolverError
-from obsynth.methods.engines.fewer_sensors import AS_QUIET, error_deviation, left_out, with_fewer_sensors
-from obsynth.methods.engines.sensor_noise import fault_deviation
+from obsynth.methods.engines.fewer_sensors import AS_QUIET, left_out, with_fewer_sensors
+from obsynth.methods.engines.sensor_noise import error_deviation, fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.gains import PdGains, certified

@@ -17,10 +17,10 @@ from obsynth.analysis.existence.sharepasand import Existence, existence
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
-from obsynth.methods.engines.fewer_sensors import AS_QUIET, error_deviation, left_out, with_fewer_sensors
+from obsynth.methods.engines.fewer_sensors import AS_QUIET, left_out, with_fewer_sensors
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.engines.region import region_gain
-from obsynth.methods.engines.sensor_noise import fault_deviation
+from obsynth.methods.engines.sensor_noise import error_deviation, fault_deviation
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.assembly import assembled

@@ -55,7 +55,6 @@ LOGS_FOR_OFFSETS = 3
 #: usual from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
 OWN_ROWS = (100, 200)
 
-
 #: Rows over which offsets of residuals are followed where one log does not tell them from drifts, and in a run whose
 #: first rows were taken for what is usual, of which they are an estimate: half as many again as the oldest change that
 #: statistics look for, of which three quarters remain.

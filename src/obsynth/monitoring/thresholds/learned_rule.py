@@ -204,15 +204,8 @@ class LearnedRule(Rule):
             changes = self._changes(state, self._bands)
             squares = self._squares(state, sample.observation)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
-            levels = self.learned.levels * self._factors(state)
-            slow = slice(1, 1 + len(smooth) + len(ratios))
-            of_means, of_ratios = np.split(levels[slow], [len(smooth)])
-            squared = (weights / of_means)[:, None] * state.means * np.abs(state.means)
-            swings, factor = state.swings.after(
-                np.concatenate([squared.ravel(), sides * ratios / of_ratios]), first[0] / levels[0], sample.time
-            )
-            levels[slow] *= factor
-            values, state = values / levels, state._replace(swings=swings)
+            state, levels = self._swung(state, weights, sides * ratios, first[0], sample.time)
+            values = values / levels
         values = np.where(np.isnan(values), np.inf, values)
         state = self._own_of_start(state._replace(alarmed=int(values.max() > 1.0)), sample.observation, counts=counts)
         # Faults are compared without what their slow offsets explain: each has its own.
@@ -245,6 +238,19 @@ class LearnedRule(Rule):
         now = np.ones(self._ranges.inputs) if sample.inputs is None else self._ranges.beyond_by(sample.inputs)
         gone = np.ones((min(missing, max(AGES)), len(now)))
         return np.vstack([before, gone, now])[-max(AGES) :]
+
+    def _swung(
+        self, state: LearnedState, weights: FloatArray, ratios: FloatArray, row: float, time: float
+    ) -> tuple[LearnedState, FloatArray]:
+        """Return the state after a row with signed likelihood ``ratios (k,)``, and levels, those of slow changes raised
+        where they swing; ``weights``: of squared means, ``row``: the statistic of the row alone."""
+        levels = self.learned.levels * self._factors(state)
+        slow = slice(1, 1 + len(weights) + len(ratios))
+        of_means, of_ratios = np.split(levels[slow], [len(weights)])
+        means = (weights / of_means)[:, None] * state.means * np.abs(state.means)
+        swings, factor = state.swings.after(np.concatenate([means.ravel(), ratios / of_ratios]), row / levels[0], time)
+        levels[slow] *= factor
+        return state._replace(swings=swings), levels
 
     def _factors(self, state: LearnedState) -> FloatArray | float:
         """Return by which factor each level is raised by the inputs of the rows that statistics look back to."""
