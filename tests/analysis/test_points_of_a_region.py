@@ -76,6 +76,7 @@ def hidden_nonlinear(ends: list[float], *, kind: str = "state") -> Any:
     return obsynth.region_observer(model, region={"w": ends}, sample_time=0.1, goal="decay")
 
 
+@pytest.mark.long
 def test_slopes_that_hide_a_mode_or_turn_algebraic_equations_are_named() -> None:
     with pytest.raises(PreconditionError, match=r"where a slope is zero.*'s0 \*\* 2\.0' by s0 is zero.*s0 = w in"):
         hidden_nonlinear([-1.0, 2.0])

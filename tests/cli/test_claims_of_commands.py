@@ -94,6 +94,7 @@ def test_a_threshold_that_adapts_has_no_number_of_the_exact_model(capsys: pytest
     assert "at the end of a run" not in told
 
 
+@pytest.mark.long
 def test_noise_that_a_test_has_bounds_of_is_in_no_deviations(capsys: pytest.CaptureFixture[str]) -> None:
     """Three deviations, the bound, were called one deviation."""
     command, _, _ = TABLE["evaluate, a guaranteed test"]

@@ -76,6 +76,7 @@ def damaged(path: Path, target: Path) -> Path:
 
 
 class TestDesign:
+    @pytest.mark.long
     def test_report_and_file(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         assert main(["design", "--system", str(WANG), "-v"]) == 0
         printed = capsys.readouterr()
@@ -189,6 +190,7 @@ class TestWidths:
         assert heading == ["check", *(["claim"] if width >= 110 else []), "value", "bound", "margin", "verdict", "kind"]
         assert sum(" holds " in line for line in lines) >= 10
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("width", [70, 78, 80, 90])
     def test_no_column_of_a_narrow_table_is_cut(
         self, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -210,6 +212,7 @@ class TestWidths:
 
 
 class TestCheck:
+    @pytest.mark.long
     def test_possible(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         assert main(["check", "--system", str(SMIB), "-v"]) == 0
         printed = capsys.readouterr().out

@@ -154,6 +154,7 @@ def test_a_page_of_gains_that_fail_says_on_the_terminal_why_the_exit_code_is_6(
     assert re.search(r"^Warning: wrong.gains.json: UNVERIFIED: \d+ of \d+ checks FAIL: ", told.err, re.MULTILINE)
 
 
+@pytest.mark.long
 def test_notes_of_a_file_are_said_to_be_unverified(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A note is a sentence: "a fault of 1e-9 is certain to raise an alarm" was printed below "Verified"."""
     plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=0.1)

@@ -197,6 +197,7 @@ def test_c_equals_a_run_that_is_resumed(seed: int, h: float, tmp_path: Path) -> 
         assert np.array_equal(found[:, 1] == 1.0, run.alarm.notna())
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_what_is_not_written_is_refused_with_what_can_be_done(tmp_path: Path) -> None:
     matrices: dict[str, Any] = {

@@ -161,6 +161,7 @@ def test_c_of_random_plants_is_affine_in_the_parameters(seed: int, tmp_path: Pat
     assert not claimed.all()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
 def test_c_of_a_kalman_filter_has_states_and_innovations(tmp_path: Path) -> None:
     plant = PolytopicSystem(
@@ -220,6 +221,7 @@ def test_arrays_hold_the_observer_at_every_vertex(name: str, suffix: str, tmp_pa
     assert found["forgetting"].item() == observer.forgetting
 
 
+@pytest.mark.long
 def test_other_files_are_refused(tmp_path: Path) -> None:
     design = obsynth.fault_estimation_filter(wang())
     with pytest.raises(SpecError, match="sampled already"):

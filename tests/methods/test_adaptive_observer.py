@@ -200,6 +200,7 @@ class TestWindUp:
         assert np.isfinite(row.parameters.theta).all()
         return np.linalg.svd(row.parameters.triangle, compute_uv=False)
 
+    @pytest.mark.long
     def test_unguarded_it_grows_without_bound(self) -> None:
         assert self.spread_without_excitation("none").min() < 1e-20
 

@@ -27,6 +27,7 @@ def test_the_curve_is_what_designs_claim() -> None:
     assert "one sample of delay takes the deviation from 0.0167" in curve.sentence
 
 
+@pytest.mark.long
 def test_mean_of_the_fault_estimation_filter() -> None:
     plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
     plain = obsynth.fault_estimation_filter(plant, gamma=0.3)

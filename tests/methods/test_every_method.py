@@ -265,6 +265,7 @@ def test_a_corrupted_design_fails(method: str) -> None:
     assert not obsynth.verify(design.replace(observer=changed)).passed
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
     design = design_of(method)

@@ -104,6 +104,7 @@ def test_a_parameter_that_is_given_counts_with_its_value() -> None:
     assert found["remainder of level"] == pytest.approx(plain["remainder of level"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_no_healthy_tank_alarms_and_twice_the_threshold_does() -> None:
     test = test_of_tank()
     assert test.report.passed

@@ -100,6 +100,7 @@ def test_a_value_of_several_kinds_is_told_what_is_wrong_with_the_kind_that_it_is
     assert [line.strip().removeprefix("- ") for line in str(caught.value).splitlines()[1:]] == told
 
 
+@pytest.mark.long
 def test_a_gain_set_for_other_constants_than_those_of_the_spec_is_told(tmp_path, capsys):
     """After a calibration the gain set of the plant before it was evaluated on that plant, without a word."""
     text = (

@@ -112,6 +112,7 @@ def _named_are_designed() -> bool:
     return all(design.report.passed for design in designs)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("method", ["adaptive_observer", "pd_observer", "functional_filter", "optimal_filter"])
 def test_a_method_that_does_not_take_a_region_says_nothing_of_other_observers(method: str) -> None:
     with pytest.raises(obsynth.PreconditionError, match=r"^This method does not take the plant") as e:

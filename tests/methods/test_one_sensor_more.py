@@ -69,6 +69,7 @@ def test_a_filter_runs_on_a_sensor_that_reads_an_input_to_rounding() -> None:
     np.testing.assert_allclose(states[0], states[1], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_a_decay_is_reached_with_less_noise_than_by_a_gain_of_that_rate(seed: int) -> None:
     rng = np.random.default_rng(seed)

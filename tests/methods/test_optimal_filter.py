@@ -511,6 +511,7 @@ SLOW_NOISE = (np.array([[0.8]]), np.array([[1.0]]), np.array([[0.3]]), np.array(
 EMPHASIS = control.tf([1.0, -0.5], [1.0, -0.9], True)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
 @pytest.mark.parametrize(("case", "delay"), [(ZERO_AT_2, 1), (STATIC, 0)])
 def test_a_weight_of_the_noise_is_a_model_of_it(case, delay, norm) -> None:

@@ -86,6 +86,7 @@ def norm_on_a_grid(design: obsynth.ObserverDesign, inputs: np.ndarray, rates: np
 
 
 class TestOptions:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("theorem", [1, 2])
     @pytest.mark.parametrize("decay", [0.0, 0.5, 3.0])
     def test_decay(self, decay: float, theorem: int) -> None:

@@ -22,6 +22,7 @@ SHARED: dict[str, Any] = {"Bw": [[1.0], [0.2], [0], [0]], "Dw": [[0.1], [0.2], [
 FAULT: dict[str, Any] = {"Bf": [[1], [0.5], [0], [0]]}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("method", "fields", "options"),
     [

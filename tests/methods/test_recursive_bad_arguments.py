@@ -75,6 +75,7 @@ CALLS: dict[str, tuple[Callable[[Any], object], tuple[Any, ...]]] = {
 GOOD: dict[str, tuple[Any, ...]] = {"constants": ({},), "units": ({},)}
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CALLS)
 def test_a_spec_error_names_the_argument(name: str) -> None:
     call, further = CALLS[name]

@@ -86,6 +86,7 @@ def test_gains_at_a_redundant_vertex_are_the_mean_of_the_others() -> None:
     assert more.proof.proved
 
 
+@pytest.mark.long
 def test_a_gain_of_zero_and_a_first_decay_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = {"A": [["0.7 + 0.1 * v", 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]]}
     region: dict[str, Any] = {"scheduling": {"v": [-1, 1]}}

@@ -140,6 +140,7 @@ ENTRIES: dict[str, Callable[[obsynth.DescriptorSystem], object]] = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_every_entry_runs_on_one_thread(entry: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []

@@ -61,6 +61,7 @@ def _record(samples: int, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatA
     return np.array(outputs), np.column_stack([u, course]), f, np.array(states)
 
 
+@pytest.mark.long
 def test_estimates_follow_whatever_the_unknown_input_and_the_course_do(sampled: ObserverDesign) -> None:
     y, u, f, x = _record(400)
     found = sampled.scheduled[1].run(y, u)
@@ -126,6 +127,7 @@ def test_the_noise_is_told_and_a_smaller_drive_of_the_faults_makes_it_less(conti
     assert quieter.certificate.claims["region_gain"] > continuous.certificate.claims["region_gain"]
 
 
+@pytest.mark.long
 def test_a_decay_that_is_asked_for_is_proved() -> None:
     assert obsynth.ui_pi_observer(sampled_plant(), decay=2.5).certificate.claims["region_decay"] <= np.exp(-0.25)
     assert obsynth.ui_pi_observer(continuous_plant(), decay=3.0).certificate.claims["region_decay"] >= 3.0

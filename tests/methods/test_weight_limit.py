@@ -36,6 +36,7 @@ def test_what_is_within_stays_as_it_is() -> None:
     assert limit.within_bound(v) is v
 
 
+@pytest.mark.long
 def test_a_limit_that_costs_nothing_calls_no_solver() -> None:
     free = obsynth.fault_estimation_filter(ROD)
     size = float(np.linalg.norm(free.gains["W"], 2))

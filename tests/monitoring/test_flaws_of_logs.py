@@ -158,6 +158,7 @@ def drive() -> obsynth.ObserverDesign:
     return obsynth.design(spec.plant, spec.method, **dict(spec.options))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("start", [{"initial_set": 0.2}, {"initial_error": 0.5}, {}])
 @pytest.mark.parametrize("gap", [["motor speed"], "row", "rows left out"])
 def test_nothing_is_decided_until_a_gap_has_settled_whatever_the_warm_up(start: dict[str, float], gap: Any) -> None:
@@ -555,6 +556,7 @@ def more_flawed(flaw: str, rows: int = 200) -> pd.DataFrame:
     return data
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("flaw", MORE_FLAWS)
 def test_recursive_designs_live_on_over_flaws(flaw: str) -> None:
     data = more_flawed(flaw)

@@ -43,6 +43,7 @@ def learned() -> obsynth.types.LearnedThresholds:
     return obsynth.learn_thresholds(design(), log(0, 1.0), false_alarms="1 per 200 rows")
 
 
+@pytest.mark.long
 def test_set_points_beyond_those_of_the_normal_log_do_not_alarm_and_are_named() -> None:
     monitor = obsynth.online_monitor(design(), "learned", normal=learned())
     run = obsynth.run_on_data(design(), log(1, 5.0), monitor=monitor)
@@ -86,6 +87,7 @@ def test_levels_rise_beyond_the_range_by_what_the_logs_say_of_the_model_alone() 
     assert 2 * delays[0] < delays[1]
 
 
+@pytest.mark.long
 def test_within_the_range_nothing_changes_and_a_large_fault_beyond_it_alarms_with_a_note() -> None:
     monitor = obsynth.online_monitor(design(), "learned", normal=learned())
     without = obsynth.online_monitor(design(), "learned", normal=replace(learned(), ranges=None))
@@ -98,6 +100,7 @@ def test_within_the_range_nothing_changes_and_a_large_fault_beyond_it_alarms_wit
     assert run.as_dict()["events"][0]["beyond"] == ["u"]
 
 
+@pytest.mark.long
 def test_ranges_are_saved_and_a_resumed_run_goes_on_with_them(tmp_path: Path) -> None:
     saved = obsynth.load_thresholds(learned().save(tmp_path / "t.json"))
     assert saved.ranges is not None

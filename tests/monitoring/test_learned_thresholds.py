@@ -143,6 +143,7 @@ def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -
     assert (largest(x)[2_010:2_100] > 1.0).mean() > 0.9
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("tail", [0.0, 0.25, -1.0])
 @pytest.mark.parametrize("rows", [450, 760, 1_100])
 def test_a_part_of_an_alarm_that_normal_rows_may_have_is_used(rows: int, tail: float) -> None:

@@ -35,6 +35,7 @@ def record(seed: int, leak: float = 0.0, bias: float = 0.0, samples: int = 120):
     return np.array(true.outputs), u
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("statistic", ["chi-square", "cusum", "nis"])
 def test_a_jump_is_found_and_named_and_nothing_else(design, statistic):
     observer = design.observer

@@ -343,6 +343,7 @@ def test_a_number_of_any_size_is_an_alarm_and_leaves_no_trace(noisy):
             assert found["threshold"][40:].notna().all()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("spacing", ["as stated", "closer", "irregular"])
 @pytest.mark.parametrize("kind", ["pointwise", "window"])
 def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):

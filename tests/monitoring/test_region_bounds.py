@@ -181,6 +181,7 @@ def test_random_inputs_and_starts_pass_no_row_of_a_filter_of_faults_that_turn(se
     assert (loud[42:] > rule.limit).any()
 
 
+@pytest.mark.long
 def test_random_inputs_raise_no_alarm_and_a_fault_does(design: ObserverDesign) -> None:
     rng, rule = np.random.default_rng(5), _monitor(design, initial_error=0.0)
     limit = rule.rule.limit  # type: ignore[attr-defined]

@@ -41,6 +41,7 @@ def log(start=(5.0, 40.0), length=ROWS) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["time", "speed", "valve", "press", "temp"])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("name", "change", "told"),
     [

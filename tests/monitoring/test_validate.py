@@ -33,6 +33,7 @@ def right():
     return designed()
 
 
+@pytest.mark.long
 def test_a_calibrated_design_agrees_with_its_log(right):
     found = validate(right, LOG, rows="0:56", columns=HELD)
     assert found.passed

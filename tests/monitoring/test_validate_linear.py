@@ -36,6 +36,7 @@ PLANT = plant_with()
 DESIGN = obsynth.fault_estimation_filter(PLANT)
 
 
+@pytest.mark.long
 def test_a_log_of_the_plant_agrees_from_another_start_and_beside_disturbances() -> None:
     found = [obsynth.validate(DESIGN, log_of(PLANT, seed)) for seed in range(2)]
     assert all(one.passed for one in found)
@@ -84,6 +85,7 @@ def test_single_wrong_samples_are_no_disagreement() -> None:
     assert "row 100" in found.verdict[0]
 
 
+@pytest.mark.long
 def test_an_input_that_acts_later_is_named() -> None:
     plant = plant_with(disturbed=False)
     log = log_of(plant)

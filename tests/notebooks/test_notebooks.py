@@ -145,6 +145,7 @@ def test_the_first_notebooks_begin_with_the_paper_s_problem(source: Path) -> Non
     assert "docs/papers.md" in source.read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_a_broken_run_is_seen() -> None:
     cell = nbformat.v4.new_code_cell("1 / 0")
     cell.execution_count = 1

@@ -187,6 +187,7 @@ def test_one_sample_says_all_that_a_record_says_at_it() -> None:
         one.colour  # noqa: B018
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_the_spreads_are_honest(form) -> None:
     """40 runs with errors drawn from P_0 and S_0: squared errors in units of the covariance are one on average."""

@@ -58,6 +58,7 @@ def kalman(**changes):
     return descriptor_kalman(plant(Phi=None, Psi=None), **{**FILTER, **changes})
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("kind", ["descriptor-kalman", "innovation", "random-walk"])
 def test_late_values_are_put_where_they_belong(kind) -> None:

@@ -219,6 +219,7 @@ def test_continuous_designs_are_refused_with_what_was_tried():
             assert obsynth.design(obsynth.discretise(delayed(), 0.05), name).report.passed
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     "call",
     [

@@ -84,6 +84,7 @@ def test_free_weight_never_costs_gain_and_is_not_beaten(solved, share):
     assert beaten == []
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("part", [0.5, 0.9, 0.9999])
 def test_gamma_below_the_least_is_refused_with_a_sound_bound(solved, part):
     proved = 0

@@ -264,6 +264,7 @@ class TestPictures:
     def test_a_filter_that_only_delays_faults_has_gain_one(self, network):
         assert np.allclose(estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
 
+    @pytest.mark.long
     def test_faults_are_those_of_the_tracking_analysis(self, continuous):
         found = estimate_gains(continuous)
         wanted = np.abs(obsynth.fault_response(continuous, found.frequencies)[:, 0, 0])
@@ -279,6 +280,7 @@ class TestPictures:
         wanted = np.linalg.eigvals(continuous.observer.Az)
         assert np.allclose(np.sort(points.get_xdata()), np.sort(wanted.real))
 
+    @pytest.mark.long
     def test_a_recursive_design_has_none(self, recursive):
         with pytest.raises(SpecError, match="no linear time-invariant observer"):
             plot_gains(recursive)

@@ -81,6 +81,7 @@ def test_axes_say_names_units_and_seconds() -> None:
     assert [axes.get_xlabel() for axes in panels] == ["", "time (s)"]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("dt", "unit"), [(1.0, "s"), (30.0, "min"), (600.0, "h"), (14400.0, "d")])
 def test_long_times_are_told_in_their_unit(dt: float, unit: str) -> None:
     """Forty samples: their last one is told by a tick at its place, in the unit of the axis."""

@@ -77,6 +77,7 @@ def test_a_continuous_plant_agrees_with_an_integrator() -> None:
     assert states[4 : 4 + len(times), 0, :2] == pytest.approx(later.y.T, abs=1e-5)
 
 
+@pytest.mark.long
 def test_a_scheduled_design_finds_the_fault_while_its_parameters_move() -> None:
     design = wang_filter()
     scenario = Scenario(

@@ -34,6 +34,7 @@ def test_one_recommendation_with_its_reason(bicycle: obsynth.Comparison) -> None
     assert ranked == sorted(ranked)
 
 
+@pytest.mark.long
 def test_an_interpreter_shows_results_as_their_text(bicycle: obsynth.Comparison) -> None:
     """Not every number of every design, as which four thousand lines stood in a notebook."""
     assert repr(bicycle) == str(bicycle)
@@ -75,6 +76,7 @@ def test_numbers_of_the_table_are_those_of_a_simulation(bicycle: obsynth.Compari
     assert entry.design.report.passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("happening", [("a", "b"), ("a",)])
 def test_units_of_a_fault_change_no_rank(happening: tuple[str, ...]) -> None:
     rng = np.random.default_rng(8)

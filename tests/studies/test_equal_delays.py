@@ -39,6 +39,7 @@ def log(rows: int = 800, *, size: float = 0.6) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["time", "u1", "y1", "y2", "f1"])
 
 
+@pytest.mark.long
 def test_the_soonest_alarm_is_first_though_another_design_has_less_noise(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     log().to_csv(file, index=False)

@@ -31,6 +31,7 @@ def test_the_drive_s_filter_beside_the_least() -> None:
     assert "1.18 times the optimum" in in_words("loss of torque", bound, least)
 
 
+@pytest.mark.long
 def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: pytest.CaptureFixture[str]) -> None:
     spec = obsynth.load_spec(DRIVE)
     found = obsynth.compare(spec.plant, scenario=spec.scenario, runs=2, methods=["fault-estimation-filter"])
@@ -51,6 +52,7 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     )
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("decay", [0.001, 0.02])
 def test_no_record_passes_the_bound_of_an_observer_that_is_slower_than_the_plant(seed: int, decay: float) -> None:

@@ -62,6 +62,7 @@ def test_last_digits_of_an_observer_of_a_slow_plant_fail_this_row_alone(method: 
     assert missed <= row.value <= 1.1 * float(missed)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_missed_is_judged_by_the_option(method: str) -> None:
     plant = slow_plant(METHODS[method][0])

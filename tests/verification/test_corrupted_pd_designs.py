@@ -423,6 +423,7 @@ def test_every_single_entry_of_the_gains_counts(name: str, letter: str) -> None:
             assert GAINS in failed(gain_entry(letter, row, column)(design)), (row, column)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", GOOD)
 def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
     design = good(name)

@@ -241,6 +241,7 @@ def test_what_the_options_ask_for_is_reached(name: str, option: str, edit: Any) 
     assert not passes(document, ("options", option), edit)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("option", "edit"),
     [("region", {"h2": [0.1, 0.9], "h1 - h2": [0.02, 0.55]}), ("region", "x"), ("sample_time", 1.0), ("faults", []),

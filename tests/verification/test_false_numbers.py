@@ -44,6 +44,7 @@ def _changed(matrix: np.ndarray, place: tuple[int, int], value: float) -> np.nda
     return changed
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("sampled", [True, False])
 @pytest.mark.parametrize("field", ["names", "from_state", "both", "from_noise", "noise_kept", "operating_point"])
 def test_states_as_written_are_recovered_under_their_names(field: str, sampled: bool) -> None:

@@ -337,6 +337,7 @@ def _random_region(seed: int, *, outputs: int = 2) -> PolytopicSystem:
     return PolytopicSystem([obsynth.DescriptorSystem(np.eye(3), A + v * turn, **shared, dt=1.0) for v in (-1.0, 1.0)])
 
 
+@pytest.mark.long
 def test_the_free_weight_is_that_of_the_constant_filter_at_one_vertex() -> None:
     plant = _random_region(1)
     one = obsynth.fault_estimation_filter(PolytopicSystem([plant.center]), gamma_margin=0.01)

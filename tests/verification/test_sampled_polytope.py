@@ -104,6 +104,7 @@ def test_what_has_no_samples_here_is_refused(errors: ErrorPolytope, dt: float, t
         sampled_polytope(errors, dt)
 
 
+@pytest.mark.long
 def test_a_continuous_plant_over_a_region_is_not_told_to_be_sampled() -> None:
     plant = obsynth.PolytopicSystem(
         plant={

@@ -45,6 +45,7 @@ def _run(
     return np.array(states), np.array(outputs)
 
 
+@pytest.mark.long
 def test_faults_are_exact_for_wild_courses(design: ObserverDesign) -> None:
     plant, observer = design.scheduled
     rng = np.random.default_rng(1)
