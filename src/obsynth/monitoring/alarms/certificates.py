@@ -92,7 +92,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
         yield from _checked_by_test(design, body, data, u, y, log)
         return
     if "disturbance" not in data:
-        # Proofs were once about disturbances that are held, without a word about it.
+        # Held and moving disturbances reach different rows: a proof that names neither proves nothing.
         words = "the certificate says what disturbances do between samples (disturbance: any or held)"
         yield _row("assumptions", words, 0.0, 1.0, False, detail="it does not: prove the alarm again")
         return
