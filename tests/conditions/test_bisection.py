@@ -68,6 +68,15 @@ def test_the_least_level_of_a_paper_is_that_of_the_riccati_equation() -> None:
     assert paper.design().report.passed
 
 
+def test_levels_where_clarabel_stalls_are_refuted_by_scs() -> None:
+    """Below the least, Clarabel says "infeasible, inaccurate" or fails; SCS finds the inequality infeasible."""
+    by_one = obsynth.conditions.wang2015(PLANT, gamma=10.0).bisect("gamma_squared", 9.0, 1.0, solver="CLARABEL")
+    found = obsynth.conditions.wang2015(PLANT, gamma=10.0).bisect("gamma_squared", 9.0, 1.0)
+    assert np.isnan(by_one.infeasible)
+    assert LEAST * 0.995 <= found.infeasible < LEAST <= found.feasible <= LEAST * 1.002
+    assert len(found.unknown) < len(by_one.unknown)
+
+
 def test_an_error_of_the_solver_is_unknown_and_not_infeasible(monkeypatch: pytest.MonkeyPatch) -> None:
     paper = obsynth.conditions.wang2015(PLANT, gamma=10.0)
     real = type(paper).solve
@@ -81,7 +90,7 @@ def test_an_error_of_the_solver_is_unknown_and_not_infeasible(monkeypatch: pytes
     found = paper.bisect("gamma_squared", 100.0, 0.0, tolerance=0.5)
     assert any(4.0 < level < 30.0 for level in found.unknown)
     assert not 4.0 < found.infeasible < 30.0
-    with pytest.raises(SolverError, match="no answer at gamma_squared = 20"):
+    with pytest.raises(SolverError, match=r"no answer at gamma_squared = 20 .*CLARABEL and SCS"):
         paper.bisect("gamma_squared", 20.0, 0.0)
 
 

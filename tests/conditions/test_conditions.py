@@ -12,6 +12,7 @@ import pytest
 import obsynth
 from obsynth import conditions
 from obsynth.analysis.structure import analyse_structure
+from obsynth.errors import SpecError
 from obsynth.numerics.norms import hinf_norm
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -113,6 +114,24 @@ def test_a_parameter_makes_a_bisection():
         found.problem.solve(solver="CLARABEL")
         low, high = (low, middle) if found.problem.status == "optimal" else (middle, high)
     assert low < 1.4647184 < high
+
+
+def test_functions_of_the_letters_change_a_problem_as_expressions_do():
+    found = conditions.wang2015(plant_of("wang2015"))
+    P, level = found.variables["P"], found.variables["gamma_squared"]
+    by_functions = found.changed(
+        constraints=lambda v: {"level": v["gamma_squared"] <= 4.0}, objective=lambda v: cp.trace(v["P"])
+    )
+    by_expressions = found.changed(constraints={"level": level <= 4.0}, objective=cp.trace(P))
+    assert list(by_functions.constraints) == list(by_expressions.constraints)
+    values = [problem.problem.solve(solver="CLARABEL") for problem in (by_functions, by_expressions)]
+    assert values[0] == pytest.approx(values[1], rel=1e-9)
+    with pytest.raises(SpecError, match="there are P, Y, gamma_squared"):
+        found.changed(constraints=lambda v: [v["L"] >= 0])
+
+
+def test_its_names_are_listed_for_completion():
+    assert dir(conditions) == conditions.__all__
 
 
 def test_the_kalman_gain_is_that_of_the_riccati_equation():

@@ -1,14 +1,15 @@
 """The papers' conditions as problems of cvxpy, to read, to change and to solve; and the inequalities they are made of.
 
-``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand``, ``kalman``, ``hinf_filter`` and
-``h2_filter`` return `Conditions`;
-``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices,
-``rated_inequalities`` those where its one parameter is slow, in continuous time, ``slope_inequality`` those of
-`SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of a nonlinear plant over a
-region;
-``turning_faults`` those of an exact decoupling of faults that turn with the scheduling;
-``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
-regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
+- of the papers, each returns `Conditions`: ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand``,
+  ``kalman``;
+- of the least filters, the same: ``hinf_filter``, ``h2_filter``;
+- over a region, the same: ``vertex_inequalities`` of an `ErrorPolytope`, ``rated_inequalities`` where its one parameter
+  is slow, ``slope_inequality`` of `SlopedErrors`, ``nonlinear_region`` (or ``region``) of a nonlinear plant,
+  ``turning_faults`` of faults that turn with the scheduling;
+- single constraints for a problem of your own: ``bounded_real``, ``h2``, ``region``, ``admissible``;
+- regions for eigenvalues: ``disk``, ``half_plane``, ``sector``.
+
+``Conditions.bisect`` returns a `Bisection` over a parameter.
 """
 
 from importlib import import_module
@@ -91,3 +92,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__
