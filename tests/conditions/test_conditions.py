@@ -146,6 +146,23 @@ def test_the_kalman_gain_is_that_of_the_riccati_equation():
     np.testing.assert_allclose(gains["L"] @ E + gains["K"] @ C, np.eye(3), atol=1e-12)
 
 
+def test_a_gain_that_differs_where_the_minimum_is_flat_is_the_kalman_gain():
+    """L misses by 2e-3 of its size, and no state's variance by more than 2e-7 of it."""
+    plant = obsynth.DescriptorSystem(
+        A=[[-0.94853697, -0.00120247], [-1.06269457, -0.07657254]],
+        C=[[-73.93261445, 0.52763904], [-27.59814522, -1.57742308], [-80.20200457, 1.61002613]],
+        Bw=np.hstack([np.diag([0.001051444, 0.044813756]), np.zeros((2, 3))]),
+        Dw=np.hstack([np.zeros((3, 2)), 0.05 * np.eye(3)]),
+        dt=0.1,
+    )
+    found = conditions.kalman(plant)
+    found.problem.solve()
+    steady = obsynth.steady_state_filter(plant)
+    gains = found.gains()
+    np.testing.assert_allclose(np.diag(gains["covariance"]), np.diag(steady.P), rtol=1e-6)
+    assert found.design().report.passed
+
+
 def test_unknown_inputs_leave_the_kalman_gain():
     plant = noisy_plant().replace(Bd=[[1.0], [0.0], [0.0]], Dd=None, disturbance_names=None)
     found = conditions.kalman(plant)

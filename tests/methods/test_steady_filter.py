@@ -136,3 +136,16 @@ def test_a_number_is_that_multiple_of_the_identity() -> None:
     number = steady_state_filter(plant, Q=0.01, R=0.1)
     matrix = steady_state_filter(plant, Q=0.01 * np.eye(2), R=[[0.1]])
     np.testing.assert_array_equal(number.P, matrix.P)
+
+
+def test_noise_that_the_plant_states_is_the_default_and_identities_where_it_states_none() -> None:
+    plant = DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.7]], C=[[1, 0], [1, 1]], Bw=[[0.3, 0, 0], [0, 0, 0]], Dw=[[0, 0.1, 0], [0, 0, 2]], dt=1.0
+    )
+    stated = steady_state_filter(plant)
+    given = steady_state_filter(plant, Q=plant.Bw @ plant.Bw.T, R=np.diag([0.01, 4.0]))
+    np.testing.assert_array_equal(stated.K, given.K)
+    without = plant.replace(Bw=None, Dw=None)
+    np.testing.assert_array_equal(steady_state_filter(without).K, steady_state_filter(without, Q=1.0, R=1.0).K)
+    # A part of it may be given.
+    np.testing.assert_array_equal(steady_state_filter(plant, R=np.diag([0.01, 4.0])).K, given.K)

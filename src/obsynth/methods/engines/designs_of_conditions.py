@@ -23,8 +23,11 @@ from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
 #: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum
-#: is flat, so that half the digits of a solver's optimum are those of its gain.
+#: is flat, so that half the digits of a solver's optimum are those of its gain ...
 SAME_GAIN = 1e-3
+
+#: ... or when no state's variance is larger by more than this share of it: what a gain adds that misses by the above.
+SAME_VARIANCE = 1e-6
 
 
 def design_of(source: str, plant: Any, *arguments: Any) -> ObserverDesign:
@@ -133,6 +136,9 @@ def _kalman(
     made = descriptor_kalman(plant, Q=Q, R=R, name=name)
     varying, process, sensor = noisy
     steady = steady_state_filter(varying, Q=process, R=sensor)
+    variances, least = np.diag(gains["covariance"]), np.diag(steady.P)
+    if np.all(variances <= (1.0 + SAME_VARIANCE) * least) and np.all(least > 0.0):
+        return made
     for letter, steady_gain in (("L", steady.L), ("K", steady.K)):
         miss = float(np.linalg.norm(gains[letter] - steady_gain) / max(float(np.linalg.norm(steady_gain)), 1.0))
         if not miss <= SAME_GAIN:

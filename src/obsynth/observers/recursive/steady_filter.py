@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.existence.condition import Condition, require_all
+from obsynth.analysis.existence.kalman import with_stated_noise
 from obsynth.analysis.existence.recursive import described_mode, recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import PreconditionError, SolverError, SpecError
@@ -77,7 +78,10 @@ class SteadyState:
 
 @arguments_checked
 def steady_state_filter(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation, *, Q: ArrayLike, R: ArrayLike
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
+    *,
+    Q: ArrayLike | None = None,
+    R: ArrayLike | None = None,
 ) -> SteadyState:
     r"""Return the steady state of the descriptor Kalman filter.
 
@@ -90,8 +94,9 @@ def steady_state_filter(
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem or Transformation
         Time-invariant, discrete; ``E (ne, nx)``, ``C (ny, nx)``.
-    Q, R : array_like
-        ``(ne, ne)`` and ``(ny, ny)``, may be singular; a number stands for that multiple of the identity.
+    Q, R : array_like, optional
+        ``(ne, ne)`` and ``(ny, ny)``, may be singular; a number stands for that multiple of the identity.  By default
+        ``Bw Bw'`` and ``Dw Dw'`` where the plant states its noise, else identities, as of `obsynth.descriptor_kalman`.
 
     Returns
     -------
@@ -130,10 +135,12 @@ def steady_state_filter(
     if not varying.is_time_invariant:
         raise SpecError("The plant changes with k: it has no steady state.", path="plant")
     require_all(recursive_conditions(varying, parameters=False))
-    q, r = as_matrix(Q, "Q"), as_matrix(R, "R")
+    own = plant.plant if isinstance(plant, Transformation) else plant
+    stated = with_stated_noise(own, {"Q": Q, "R": R})
+    covariances = {name: 1.0 if given is None else given for name, given in stated.items()}
     q, r = (
-        float(following[0, 0]) * np.eye(size) if np.ndim(stated) == 0 else following
-        for stated, following, size in ((Q, q, varying.ne), (R, r, varying.ny))
+        float(as_matrix(given, name)[0, 0]) * np.eye(size) if np.ndim(given) == 0 else as_matrix(given, name)
+        for (name, given), size in zip(covariances.items(), (varying.ne, varying.ny), strict=True)
     )
     for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
         require_shape(matrix.shape, (size, size), name)
