@@ -17,6 +17,7 @@ from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, exact_numbers
 from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, plant_fields
 from obsynth.plants.other_names import plant_keywords_suggested
+from obsynth.plants.resized import with_what_follows
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
 #: Larger plants as written are not stored with a design: their elimination is checked where it is done.
@@ -270,6 +271,7 @@ class DescriptorSystem:
         Tolerances and exact numbers are those of the matrices as they were: with a change of one of these they are
         not carried over, and whatever would use tolerances refuses (``uncertainty=None`` says that the model is exact).
         Units and other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
+        Matrices without entries, E = I and names such as u1, u2 follow the sizes of the changed matrices.
 
         Parameters
         ----------
@@ -277,6 +279,7 @@ class DescriptorSystem:
             Any argument of the constructor.
         """
         arguments = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
+        changes = with_what_follows(arguments, changes)
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
         gone -= {
             name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else arguments[field])

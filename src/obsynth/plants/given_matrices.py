@@ -42,7 +42,7 @@ MATRIX_LAYOUT = (
 )
 
 #: Names of the signals of each kind.
-_FIELDS = {
+SIGNAL_FIELDS = {
     "x": "state_names",
     "u": "input_names",
     "y": "output_names",
@@ -59,7 +59,7 @@ SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
 
-SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+SIGNAL_NAMES = tuple(SIGNAL_FIELDS.values())
 
 ALL_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
@@ -75,8 +75,8 @@ def _without_frames(
         if not (hasattr(frame, "columns") and hasattr(frame, "index") and hasattr(frame, "to_numpy")):
             continue
         _require_no_texts(frame, name)
-        rows = _order(frame.index, _FIELDS[rows_of], labels, f"the rows of {name}")
-        columns = _order(frame.columns, _FIELDS[columns_of], labels, f"the columns of {name}")
+        rows = _order(frame.index, SIGNAL_FIELDS[rows_of], labels, f"the rows of {name}")
+        columns = _order(frame.columns, SIGNAL_FIELDS[columns_of], labels, f"the columns of {name}")
         plain[name] = frame.to_numpy()[rows][:, columns] if len(frame) else frame.to_numpy()
     return plain, labels
 
@@ -164,7 +164,7 @@ def plant_fields(
         if not unknown.intersection((rows, columns))
     }
     values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
-    for signal, key in _FIELDS.items():
+    for signal, key in SIGNAL_FIELDS.items():
         if signal in unknown or signal == "x":
             continue
         own = plain_names(labels[key])
@@ -179,10 +179,10 @@ def plant_fields(
             first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=key)
             stated = (*first, *extra)
         values[key] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=key))
-    if any(values.get(field) is None for field in _FIELDS.values()):
+    if any(values.get(field) is None for field in SIGNAL_FIELDS.values()):
         # What refers to signals by name cannot be judged.
         problems.raise_if_any()
-    known, measured = {name for field in _FIELDS.values() for name in values[field]}, set(values["input_names"])
+    known, measured = {name for field in SIGNAL_FIELDS.values() for name in values[field]}, set(values["input_names"])
     measured |= set(values["output_names"])
     values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
     values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))

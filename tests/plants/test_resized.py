@@ -1,0 +1,65 @@
+"""Plants with matrices of another size: what has no entries and numbered names follow, names of users do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import obsynth
+from obsynth.errors import SpecError
+
+PLANT = obsynth.DescriptorSystem(A=0.5 * np.eye(2), B=[[1], [0]], C=np.eye(2), Bf=[[1], [0]], dt=1.0)
+
+CHANGES = {
+    "an unknown input": ({"Bd": [[1], [0]]}, (1, 2, 1, 1, 0)),
+    "two faults": ({"Bf": np.eye(2)}, (1, 2, 2, 0, 0)),
+    "no fault": ({"Bf": None}, (1, 2, 0, 0, 0)),
+    "no input": ({"B": None}, (0, 2, 1, 0, 0)),
+    "noise of sensors": ({"Dw": np.eye(2)}, (1, 2, 1, 0, 2)),
+    "one sensor": ({"C": [[1, 0]]}, (1, 1, 1, 0, 0)),
+    "faults of states by name": ({"Bf": ["x1", "x2"]}, (1, 2, 2, 0, 0)),
+    "three states": (
+        {"A": 0.5 * np.eye(3), "B": np.ones((3, 2)), "C": np.eye(3), "Bf": np.ones((3, 1))},
+        (2, 3, 1, 0, 0),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_has_no_entries_and_numbered_names_follow(name: str) -> None:
+    changes, sizes = CHANGES[name]
+    plant = PLANT.replace(**changes)
+    assert (plant.nu, plant.ny, plant.nf, plant.nd, plant.nw) == sizes
+    np.testing.assert_array_equal(plant.E, np.eye(plant.nx))
+    assert plant.input_names == tuple(f"u{i + 1}" for i in range(plant.nu))
+
+
+def test_sparse_matrices_follow_as_dense_ones_do() -> None:
+    sparse = PLANT.replace(A=scipy.sparse.csr_array(PLANT.A), C=scipy.sparse.csr_array(PLANT.C))
+    for changes, sizes in CHANGES.values():
+        plant = sparse.replace(**changes)
+        assert (plant.nu, plant.ny, plant.nf, plant.nd, plant.nw) == sizes
+
+
+def test_names_that_a_user_gave_stay_with_their_signals_or_are_asked_for() -> None:
+    named = PLANT.replace(input_names=["pump"], fault_names=["leak"], units={"leak": "kg/s"})
+    assert named.replace(Bf=[[1], [1]]).fault_names == ("leak",)
+    assert named.replace(Bd=[[1], [0]]).input_names == ("pump",)
+    gone = named.replace(Bf=None)
+    assert gone.fault_names == ()
+    assert "leak" not in gone.units
+    with pytest.raises(SpecError, match="input_names has 1 name, but the plant has 2 known inputs"):
+        named.replace(B=np.eye(2))
+
+
+def test_what_has_entries_is_not_resized() -> None:
+    with_feedthrough = PLANT.replace(D=[[1], [0]])
+    with pytest.raises(SpecError, match="D is 2 by 1, but 2 by 2 is needed"):
+        with_feedthrough.replace(B=np.eye(2))
+    # The sensors' part of a fault stays when that of the dynamics goes.
+    assert PLANT.replace(Df=[[0], [1]]).replace(Bf=None).nf == 1
+
+
+def test_faults_of_sensors_are_added_to_those_of_the_dynamics() -> None:
+    assert PLANT.replace(Df=["y2"]).fault_names == ("f1", "y2")
