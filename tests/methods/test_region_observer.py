@@ -358,3 +358,74 @@ def test_a_growing_mode_that_no_output_shows_is_named() -> None:
     )  # fmt: skip
     with pytest.raises(PreconditionError, match="of z is shown by no output and does not decay"):
         obsynth.region_observer(model, region={"z": [-0.5, 1.0]}, sample_time=0.1, noise={"y": 0.1, "fault": 0.1})
+
+
+def test_a_step_is_found_where_newton_alone_goes_round_in_circles() -> None:
+    model = DAEModel(
+        {
+            "e1": "0.5 * der(x1) + 0.3 * der(x2) = -0.88 * x1 - 0.357 * x2 - 0.209 * x3 + 0.65 * bend + 0.2 * w1"
+                  " - 0.16 * w2",
+            "e2": "0.5 * der(x2) = -0.369 * x1 - 1.338 * x2 - 0.039 * x3 + 0.79 * bend - 0.04 * w1 + 0.19 * w2",
+            "e3": "0.5 * der(x3) = 0.523 * x1 - 1.293 * x2 - 0.641 * x3 + 0.55 * bend + 0.09 * w1 - 0.19 * w2",
+            "a1": "w1 = -0.39 * bend - 0.07 * x3 - 0.75 * x1",
+            "a2": "w2 = -0.53 * (0.8 * x3 - 0.57 * x2) ** 2 - 0.95 * x1 + 0.61 * x2 + 0.3 * sin(w2) + 0.2 * w1",
+        },
+        {"y1": "x1", "y2": "-0.57 * x3 - 0.37 * x2", "y3": "-0.32 * x2 - 0.13 * x3"},
+        definitions={"bend": "log(0.11 * x3 - 0.03 * x2 + 9) * sin(-0.29 * x1 + 0.58)"},
+        states=dict.fromkeys(["x1", "x2", "x3", "w1", "w2"], 0.0), inputs={}, parameters={},
+    )  # fmt: skip
+    made = obsynth.region_observer(
+        model, region={"x1": [-1.46, 0.84], "x2": [-0.62, 1.66], "x3": [-1.47, 1.22], "w2": [-4, 4]}, sample_time=5.0,
+        noise={"y1": 0.02, "y2": 0.02, "y3": 0.02, "der(x1)": 0.1, "der(x2)": 0.1, "der(x3)": 0.1}, goal="gain",
+    )  # fmt: skip
+    observer = made.over_region[1]
+    rng = np.random.default_rng(11)
+    y = 0.1 * rng.standard_normal((4, 3))
+    ends = [
+        replace(observer, initial_state=far * rng.standard_normal(5)).run(np.tile(y[:1], (40, 1))).states[-1]
+        for far in (0.0, 1.0, 30.0, 1000.0)
+    ]
+    # One solution: from everywhere to the same rest, where equations and gain are in balance.
+    for end in ends[1:]:
+        assert end == pytest.approx(ends[0], abs=1e-9)
+
+
+def test_slow_plants_have_a_decay_too() -> None:
+    # A store of 1e9 units: its rates are 1e-10 of those of a plant in seconds.
+    store = DAEModel(
+        {"balance": "1e9 * der(p) = q - 1e3 * sqrt(p) - leak"}, {"y": "p"}, states={"p": 1e6}, inputs={"q": 1e6},
+        parameters={"leak": 0.0},
+    )  # fmt: skip
+    made = obsynth.region_observer(store, region={"p": [1e5, 1e7]}, sample_time=10.0, noise={"y": 1e2, "leak": 1e3})
+    assert 1e-8 < made.certificate.claims["region_decay"] < 1e-4
+    assert made.report.passed
+
+
+def test_rates_alone_do_not_run_away_where_noise_is_stated() -> None:
+    model = DAEModel(
+        {"a": "der(x) = -x + 0.5 * sin(z)", "b": "der(z) = -z + 0.3 * tanh(x)"}, {"y1": "x", "y2": "z"},
+        states={"x": 0.0, "z": 0.0}, inputs={}, parameters={},
+    )  # fmt: skip
+    region = {"x": [-1, 1], "z": [-1, 1]}
+    for noise in (None, {"y1": 0.01, "y2": 0.01, "der(x)": 0.1, "der(z)": 0.1}):
+        made = obsynth.region_observer(model, region=region, sample_time=0.05, goal="decay", noise=noise)
+        assert np.abs(made.gains["L"]).max() < 1e4
+
+
+def test_what_depends_on_known_inputs_alone_needs_no_range() -> None:
+    model = DAEModel(
+        {"a": "der(x) = -x + 0.2 * x ** 3 + sign(u) * sqrt(abs(u))"}, {"y": "x"}, states={"x": 0.0}, inputs={"u": 0.0},
+        parameters={},
+    )  # fmt: skip
+    made = obsynth.region_observer(model, region={"x": [-1, 1]}, sample_time=0.1, goal="decay")
+    assert made.report.passed
+    found = made.over_region[1].run(np.full((200, 1), 0.5), np.full((200, 1), 0.475**2))
+    assert found.states[-1, 0] == pytest.approx(0.5, abs=1e-9)
+
+
+def test_a_model_in_which_nothing_moves_and_an_output_among_the_ranges_are_refused_by_name() -> None:
+    static = DAEModel({"a": "x = 1 + 0.1 * sin(x)"}, {"y": "x"}, states={"x": 1.0}, inputs={}, parameters={})
+    with pytest.raises(PreconditionError, match="no state moves and no parameter is a fault"):
+        obsynth.region_observer(static, region={"x": [-2, 2]}, sample_time=0.1, goal="decay")
+    with pytest.raises(SpecError, match="names 'l1'; there are: h1, h2, leak, out, q"):
+        obsynth.region_observer(tanks(), region={"l1": [0.1, 1]}, sample_time=STEP, noise=NOISE)

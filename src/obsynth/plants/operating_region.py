@@ -83,7 +83,15 @@ class OperatingRegion:
             )
         known = (*terms.names, *terms.input_names)
         ranges = tuple(_range(str(text), ends, known) for text, ends in region.items())
-        arguments = np.array([_argument_range(each, ranges) for each in terms.arguments]).reshape(-1, 2)
+        # Of known inputs alone plant and observer have the same: no slope depends on their ranges.
+        moved = [each for each in terms.nonlinearities if terms.state_parts[list(each.arguments)].any()]
+        needed = {j for each in moved for j in each.arguments}
+        arguments = np.array(
+            [
+                _argument_range(each, ranges) if j in needed else (-np.inf, np.inf)
+                for j, each in enumerate(terms.arguments)
+            ]
+        ).reshape(-1, 2)
         return cls(terms, ranges, arguments)
 
     def slopes(self) -> tuple[Slope, ...]:

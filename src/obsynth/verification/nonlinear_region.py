@@ -23,11 +23,11 @@ from obsynth.verification.error_polytope import driven_by
 
 #: What a difference and a sum of two numbers are rounded by: the middle of bounds and half their width hold them.
 _HALF_ROOM = 1.0 + 8.0 * float(np.finfo(np.float64).eps)
-#: Halvings towards the fastest decay that a certificate proves.
-_HALVINGS = 24
-
-#: Where the search for a rate ends, as a share of it.
-_NEAR = 1e-3
+#: The slowest rate that is looked for, as a share of the fastest there could be: levels of oil fields and gyroscopes
+#: stand in one model.
+_SLOWEST_SHARE = 2.0**-60
+#: Where the search for a rate ends: the next one that was tried is this much faster.
+_NEAR = 1.001
 
 
 def directions(terms: NonlinearTerms, slopes: Sequence[Slope]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -94,16 +94,14 @@ def middle_and_half(bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def fastest_decay(vertices: Proved, witness: Witness, limit: float) -> float:
-    """Return a rate near the fastest that a certificate proves, from a floating-point guess; 0 without any."""
-    low, high = 0.0, limit
-    if not prove_decay(vertices, witness, 0.0, discrete=False).proved:
+    """Return a rate near the fastest that a certificate proves, by halving on a scale of logarithms; 0 without any."""
+    low, high = limit * _SLOWEST_SHARE, limit
+    if not prove_decay(vertices, witness, low, discrete=False).proved:
         return 0.0
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
+    while high > _NEAR * low:
+        middle = float(np.sqrt(low) * np.sqrt(high))
         if prove_decay(vertices, witness, middle, discrete=False).proved:
             low = middle
         else:
             high = middle
-        if high - low <= _NEAR * high:
-            break
     return low

@@ -54,7 +54,8 @@ class Condition:
                 else f"{self._opening}the condition {self.name!r} fails ({self.source}). "
             )
             missing = [repr(name) for name in self.signals if repr(name) not in self.detail]
-            involved = f" Signals involved: {', '.join(missing)}." if missing else ""
+            ended = "" if not missing or self.detail.endswith((".", "?", "!")) else "."
+            involved = f"{ended} Signals involved: {', '.join(missing)}." if missing else ""
             raise PreconditionError(
                 f"{opening}Needed: {self.claim}. Found: {self.detail}{involved}",
                 condition=self.name,

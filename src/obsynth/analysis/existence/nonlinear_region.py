@@ -51,6 +51,10 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         f"{len(terms.names) - terms.differential} algebraic, {counted(count, 'nonlinearity', 'nonlinearities')}",
         value=1.0,
     )
+    if not terms.differential:
+        text = "no state moves and no parameter is a fault: solve the equations in every row"
+        yield _of_the_form("states that move", "a state or a fault moves", text)
+        return
     if region is None:
         text = "give ranges of the signals (option region)"
         yield _of_the_form("region stated", "the region is stated", text)

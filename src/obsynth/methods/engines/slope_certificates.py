@@ -157,7 +157,7 @@ def best_decay_of_slopes(
     start = solved(0.0, None)
     if start is not None:
         reached = faster(solved, *start, discrete=False)
-        near = () if gain is not None else slower(reached[-1][0], MARGINS, None)
+        near = () if gain is not None else slower(min(reached[-1][0], limit), MARGINS, None)
         for rate, problem in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             L, witness = problem.gains()["L[1]"], _witness(problem, errors, factors, "decay", 1.0)
             for trial in slower(min(rate, limit), DECAY_SHARES, None):

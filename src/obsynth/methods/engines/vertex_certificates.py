@@ -417,7 +417,8 @@ def best_decay(
     if start is not None:
         reached = faster(solved, *start, discrete=discrete)
         shares = margins if margins is not None else () if gains else MARGINS
-        near = slower(reached[-1][0], shares, 1.0 if discrete else None)
+        fastest_sought = reached[-1][0] if discrete else min(reached[-1][0], limit)
+        near = slower(fastest_sought, shares, 1.0 if discrete else None)
         for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             sought = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
             made = sought if extreme is None or gains is not None else extreme.gains(sought)

@@ -43,7 +43,7 @@ class RegionObserverMethod(Method):
         proved.  No formula may jump.
     region : mapping
         Ranges ``{name: [low, high]}`` of states, faults, inputs, or linear combinations of these such as ``"h1 - h2"``:
-        at least of everything on which a nonlinearity depends.
+        at least of everything on which a nonlinearity depends in which there is a state or a fault.
     sample_time : float, seconds
         Between rows; the observer takes steps of implicit Euler, for which the same certificate is proved.
     noise : mapping, optional

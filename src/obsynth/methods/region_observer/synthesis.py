@@ -14,6 +14,7 @@ from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.slope_multipliers import SlopedErrors
 from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.fastest_decay import rate_within
 from obsynth.methods.engines.slope_certificates import best_decay_of_slopes, certified_slopes
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
@@ -26,7 +27,9 @@ from obsynth.observers.records import named_vector
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.operating_region import OperatingRegion, Slope
 from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
-from obsynth.proofs.vertex_inequalities import Witness, prove_decay, prove_gain, prove_mean_square
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.slope_blocks import SlopeBlock
+from obsynth.proofs.vertex_inequalities import Proved, Witness, prove_decay, prove_gain, prove_mean_square
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.nonlinear_drive import drive_of, wanted_of
@@ -36,7 +39,6 @@ from obsynth.verification.nonlinear_region import (
     directions,
     fastest_decay,
     middle_and_half,
-    whole_gain,
 )
 from obsynth.verification.over_region import GAIN_WITNESSES, rows_of_euler, stored_witness
 
@@ -46,6 +48,8 @@ SLOPE_ROOM = 1e-9
 DESIGN_MARGIN = 2e-2
 #: The largest gain that rates alone may ask for, in units of the plant's own, and the fastest rate.
 DECAY_LIMIT = 1e2
+#: The rate that a certificate allows at one corner is computed in floating point: what is tried begins above it.
+FASTEST_ROOM = 1.01
 #: Noise on states that nothing drives, as a share of that on the others, where sizes of errors are estimated.
 LEAST_DRIVE = 1e-3
 #: How far a level may be raised where that of the scaled problem just misses the proof of the shipped numbers.
@@ -306,7 +310,7 @@ def _proved(
     vertices = corner_errors(terms, slopes, bounds, solution.gain, drive)
     wanted = asked.decay or 0.0
     witness = problem.decay_of(solution.gain) or solution.of_decay
-    rate = fastest_decay(vertices, witness, _fastest(terms, solution.gain))
+    rate = fastest_decay(vertices, witness, _fastest(vertices, witness))
     if rate < wanted and prove_decay(vertices, solution.of_decay, wanted, discrete=False).proved:
         rate, witness = wanted, solution.of_decay
     matrices = stored_witness(witness)
@@ -330,10 +334,13 @@ def _proved(
     )
 
 
-def _fastest(terms: NonlinearTerms, gain: FloatArray) -> float:
-    """Return a rate above any that could be proved: the size of the closed system."""
-    closed = terms.A - whole_gain(terms, gain) @ terms.C
-    return float(np.linalg.norm(closed[: terms.differential])) + 1.0
+def _fastest(vertices: Proved, witness: Witness) -> float:
+    """Return a rate above any that could be proved: what the certificate allows at one corner, or in the middle."""
+    vertex = vertices.nominal if isinstance(vertices, SlopeBlock) else vertices[0]
+    P, G = witness.P[0], witness.P[0] if witness.G is None else witness.G[0]
+    GM = G.T @ vertex(Ball)[0].midpoint
+    rate = rate_within(-(GM + GM.T), P)
+    return 0.0 if rate is None else FASTEST_ROOM * rate
 
 
 def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObserverMethod) -> list[str]:

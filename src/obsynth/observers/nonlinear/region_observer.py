@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -40,7 +40,6 @@ class RegionState(NamedTuple):
 
     z: FloatArray  # ``(n,)``: differential states, faults, algebraic states
     k: int  # the next sample
-    inputs: FloatArray  # ``(nu + ny,)``: known inputs and outputs of the sample before
     unclaimed: int  # rows for which nothing is claimed yet
 
 
@@ -210,17 +209,19 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
 
     @cached_property
     def copied_model(self) -> DAEModel:
-        """The copy of the plant with continued nonlinearities and the gain; its inputs are u, then y."""
+        """The copy of the plant with continued nonlinearities and the gain; its inputs are u, y, and what each equation
+        is short of zero by: zero but on the way to a solution."""
         terms = self.terms
 
         def equations(rates: Any, z: Any, inputs: Any, _: Any) -> list[Any]:
             state, signals = ca.vertcat(*z), ca.vertcat(*inputs)
-            u, y = signals[: len(terms.input_names)], signals[len(terms.input_names) :]
+            u, y, short = ca.vertsplit(signals, self._places_of_inputs)
             values = self._continued(state, u)
             expected = _times(terms.C, state) + ca.DM(terms.c_y) + _times(terms.Wy, values)
             total = _times(terms.A, state) + _times(terms.B, u) + ca.DM(terms.c) + _times(terms.W, values)
             total[: terms.differential] += _times(self.gain, y - expected)
-            return [rates[i] - total[i] if i < terms.differential else -total[i] for i in range(len(terms.names))]
+            moving = [rates[i] if i < terms.differential else 0.0 for i in range(len(terms.names))]
+            return [rate - total[i] - short[i] for i, rate in enumerate(moving)]
 
         def outputs(z: Any, _: Any) -> list[Any]:
             return list(z)
@@ -231,11 +232,18 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
             equations,
             outputs,
             states={name: nominal[name] for name in terms.names},
-            inputs={f"in_{i}": 0.0 for i in range(len(terms.input_names) + len(terms.output_names))},
+            inputs={f"in_{i}": 0.0 for i in range(self._places_of_inputs[-1])},
             equation_names=terms.equations,
             output_names=tuple(f"out_{i}" for i in range(len(terms.names))),
             storage=lambda z, _: [z[i] for i in range(terms.differential)],
         )
+
+    @property
+    def _places_of_inputs(self) -> list[int]:
+        """Where u, y, and what equations are short by begin among the inputs of the copy, and the number of these."""
+        terms = self.terms
+        sizes = (len(terms.input_names), len(terms.output_names), len(terms.names))
+        return [0, *np.cumsum(sizes).tolist()]
 
     def _continued(self, z: Any, u: Any) -> Any:
         """Return the nonlinearities at an estimate, continued beyond the region, as a CasADi column."""
@@ -300,8 +308,7 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
 
     def init(self) -> RegionState:
         """Return the state before the first sample."""
-        signals = len(self.input_names) + len(self.output_names)
-        return RegionState(np.array(self.initial_state), 0, np.zeros(signals), 0)
+        return RegionState(np.array(self.initial_state), 0, 0)
 
     def advance(self, state: RegionState, y: FloatArray, u: FloatArray) -> tuple[RegionState, FloatArray]:
         """Return the state after a sample and the row ``[xhat, fhat, r]``, without checking the sample.
@@ -318,15 +325,26 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         SolverError
             The step was not solved; k and the worst equation are named.
         """
-        inputs = np.concatenate([u, y])
-        before = state.inputs if state.k else None
-        solution = self._implicit.solve(state.z, inputs, np.zeros(0), before=before, k=state.k)
-        z = np.array(solution.x)
+        z = self._solved(state.z, np.concatenate([u, y, np.zeros(len(state.z))]), state.k)
         expected = np.array(self._expected(z, u).full())[:, 0]
         inside = self.is_inside(z, u, y)
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         row = np.concatenate([z[self.places], y - expected])
-        return RegionState(z, state.k + 1, inputs, unclaimed), row
+        return RegionState(z, state.k + 1, unclaimed), row
+
+    def _solved(self, z: FloatArray, inputs: FloatArray, k: int) -> FloatArray:
+        """Return the state after a step of implicit Euler.
+
+        Where Newton does not find it, what equations are short by at the last state is led to zero: the certificate
+        says that there is exactly one solution all the way.
+        """
+        implicit, none = self._implicit, np.zeros(0)
+        try:
+            return np.array(implicit.solve(z, inputs, none, k=k).x)
+        except SolverError:
+            short = implicit.functions.residual(z, z, inputs, none, np.array([self.dt]))[0][:, 0]
+            begun = np.concatenate([inputs[: -len(z)], short])
+            return np.array(implicit.solve_carefully(z, inputs, none, before=begun, k=k).x)
 
     def step(self, state: RegionState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RegionState, Estimates]:
         """Return the state after a sample, and the estimates at it.

@@ -21,6 +21,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
+from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_equations import equation_of
 from obsynth.plants.scheduling import TEXTS_OF_OPERATIONS
@@ -214,7 +215,10 @@ class _Registry:
         self.path = path
         unknown = sorted(expression.names - set(known))
         if unknown:
-            raise SpecError(f"{path}: {expression.text!r} uses {unknown[0]!r}, which is not known.", path=path)
+            names = (name for name in known if name not in NAMED_NUMBERS)
+            raise SpecError(
+                f"{path}: {expression.text!r} names {unknown[0]!r}; {there_are(unknown[0], names)}", path=path
+            )
         translated = expression.translated(known, self._operation)
         return translated if isinstance(translated, _Form) else _Form.number(translated)
 
