@@ -339,7 +339,7 @@ def _design(
         if slowest < float(found.group(1)) * (1.0 - 1e-3):
             sentences.refute("decay", f"{found.group(1)}, the slowest pole has {slowest:.6g}")
     for told, found in sentences.paragraphs(
-        rf"The threshold is {NUMBER}; the smallest possible with (\d+) samples is {NUMBER} \(proved"
+        rf"The threshold is {NUMBER}; none with (\d+) samples is below {NUMBER} \(proved"
     ):
         moving, fixed = "any time course, between samples too" in told, bool(HELD.search(told))
         sentences.expect("threshold of a test", whole, EXACT)

@@ -247,6 +247,17 @@ def test_the_least_gain_of_a_filter_is_that_of_its_matrices() -> None:
     assert obsynth.fault_estimation_filter(plant, weight="free", gamma=1.1).certificate.claims["gamma"] <= 1.1
 
 
+def test_a_quiet_report_prints_nothing_on_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0)
+    gains, page = tmp_path / "filter.json", tmp_path / "page.html"
+    obsynth.fault_estimation_filter(plant).save(gains)
+    command = ["report", "--gains", str(gains), "--out", str(page), "--force"]
+    assert main([*command, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(command) == 0
+    assert "drawing the page" in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_a_page_and_a_proof_say_for_what_gains_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, design = filtered()

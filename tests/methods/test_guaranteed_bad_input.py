@@ -103,7 +103,7 @@ def test_deviations_of_noise_that_nobody_states_are_refused() -> None:
         obsynth.guaranteed_test(quiet, **GOOD)
     bounded = obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": {"level": 0.3}})
     assert bounded.threshold == pytest.approx(obsynth.guaranteed_test(plant(), **GOOD).threshold, rel=1e-9)
-    assert "noise within its stated bounds" in str(bounded)
+    assert "disturbances and noise within their stated bounds" in " ".join(str(bounded).split())
     assert "no sensor noise given" in str(obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": None}))
 
 

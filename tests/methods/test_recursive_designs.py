@@ -145,6 +145,11 @@ class TestRefusals:
         continuous = check(DescriptorSystem(None, -np.eye(2), C=np.eye(2)))
         assert "continuous" in continuous["descriptor-kalman"].checks[0].detail
 
+    @pytest.mark.parametrize("name", ["Q", "R"])
+    def test_a_covariance_that_is_one_text_is_named(self, name: str) -> None:
+        with pytest.raises(SpecError, match=f"{name} is the text '1': give a number, or the rows of"):
+            obsynth.descriptor_kalman(varying(horizon=20), **{**NOISE, name: "1"})
+
     def test_options(self) -> None:
         plant = varying(horizon=20)
         for options, part in (

@@ -150,7 +150,7 @@ def test_the_verdict_comes_first(network, tmp_path):
     # What can be detected, how small and how soon; then whether it is verified.
     assert page.texts[2] == "What can be detected"
     sentence = (
-        r"tm GENCLS 1: 0\.201 pu exceeds 5 standard deviations .* after .*; a sine of amplitude 1 pu in active power"
+        r"tm GENCLS 1: 0\.202 pu exceeds 5 standard deviations .* after .*; a sine of amplitude 1 pu in active power"
     )
     assert re.match(sentence, page.texts[3])
     assert re.fullmatch(r"Verified: all \d+ checks hold\.", page.texts[4])

@@ -14,6 +14,7 @@ from scipy.linalg import expm
 import obsynth
 from obsynth.cli.main import main
 from obsynth.plants.constants import constants_box, shown
+from obsynth.report.designs import promises
 from obsynth.report.headline import headline
 from obsynth.report.summary import summary
 from obsynth.studies.least_thresholds import in_words
@@ -211,6 +212,30 @@ def test_the_time_of_the_slowest_mode_is_not_called_that_of_the_response() -> No
     slowest = np.max(np.linalg.eigvals(observer.Az).real)
     assert np.exp(slowest * float(found.group(1))) == pytest.approx(0.02, rel=0.2)
     assert "settling time" not in text
+
+
+def test_the_slowest_mode_does_not_wait_for_the_delay_of_the_estimates() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1.0], [0.0]], dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1}
+    )
+    design = obsynth.functional_filter(plant, fault_rate=0.01, delay=10)
+    text, observer = " ".join(str(summary(design)).split()), design.linear[1]
+    assert observer.fault_delays == (10,)
+    (found,) = re.findall(r"the slowest mode falls to 2 % in ([\d.]+) s", text)
+    samples = np.log(0.02) / np.log(np.max(np.abs(np.linalg.eigvals(observer.Az))))
+    assert samples <= float(found) < max(samples, observer.order) + 1.0
+
+
+@pytest.mark.parametrize(("claimed", "printed"), [(1.53841, "1.539"), (1.5, "1.5"), (0.300049, "0.3001")])
+def test_a_claimed_bound_is_not_rounded_below_itself(claimed: float, printed: str) -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0)
+    design = obsynth.fault_estimation_filter(plant)
+    claims = design.certificate.claims | {"gamma": claimed, "gamma_min": claimed}
+    design = design.replace(certificate=obsynth.Certificate(design.certificate.matrices, claims))
+    assert f"gamma = {printed}, " in str(summary(design))
+    listed = {name: value for name, value, _ in promises(design)}
+    assert listed["gamma"] == printed
+    assert float(listed["gamma min"]) <= claimed
 
 
 @pytest.mark.parametrize("between", [0.01, 0.002])

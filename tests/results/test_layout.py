@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from obsynth.numerics.spectra import pole_text
-from obsynth.results.layout import complex_numbers, upper_number
+from obsynth.results.checks import information, lower_bound_check, upper_bound_check
+from obsynth.results.layout import bound_number, complex_numbers, lower_number, number, shown_numbers, upper_number
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -13,12 +14,32 @@ def test_an_upper_number_is_not_below_what_it_stands_for(seed: int) -> None:
     value, digits = float(10.0 ** rng.uniform(-12, 12)), int(rng.integers(2, 6))
     told = float(upper_number(value, digits=digits).replace(",", ""))
     assert value <= told <= value * (1.0 + 10.0 ** (1 - digits))
+    told = float(lower_number(value, digits=digits).replace(",", ""))
+    assert value * (1.0 - 10.0 ** (1 - digits)) <= told <= value
+    told = float(lower_number(-value, digits=digits).replace(",", ""))
+    assert -value * (1.0 + 10.0 ** (1 - digits)) <= told <= -value
 
 
 def test_upper_numbers_that_are_exact_stay() -> None:
     assert [upper_number(value) for value in (0.1, 46.1, 46.108, 0.0, 9.996)] == ["0.1", "46.1", "46.2", "0", "10"]
     assert upper_number(float("inf")) == "inf"
     assert upper_number(float("nan")) == "-"
+
+
+def test_numbers_are_rounded_to_the_side_of_what_they_bound() -> None:
+    assert [bound_number(1.23449, side) for side in ("at most", "at least", "")] == ["1.235", "1.234", "1.234"]
+    assert bound_number(1.23451, "at least") == "1.234"
+    assert bound_number(float("nan"), "at most") == bound_number("x", "at least") == "-"  # type: ignore[arg-type]
+
+
+def test_proved_numbers_of_a_row_are_rounded_outwards() -> None:
+    row = upper_bound_check("gain", "at most", 0.990142, 1.234449, source="here", kind="proved")
+    assert shown_numbers(row)[:2] == ("0.9902", "1.235")
+    row = lower_bound_check("decay", "at least", 0.0351904, 0.0351869, source="here", kind="proved")
+    assert shown_numbers(row)[:2] == ("0.03519", "0.03518")
+    row = upper_bound_check("residual", "small", 0.990142, 1.234449, source="here", kind="equality")
+    assert shown_numbers(row)[:2] == (number(0.990142), number(1.234449))
+    assert shown_numbers(information("mean", "of a run", 0.99014, source="here", status="proved"))[0] == "0.9901"
 
 
 def test_what_is_rounding_of_a_number_is_not_printed() -> None:

@@ -75,6 +75,34 @@ def test_what_is_missed_is_judged_by_the_option(method: str) -> None:
     assert failed(design.replace(options={**design.options, "steady_error_limit": 0.0})) == {"options"}
 
 
+TURNING = {"Phi": [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]], "Cw": [[1.0, 0.0]]}
+
+
+@pytest.mark.parametrize("limit", [5e-4, 2e-3, 0.5])
+def test_no_limit_is_taken_where_nothing_is_claimed_of_constant_faults(limit: float) -> None:
+    plant = DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1.0], [0.0]], dt=0.1)
+    design = obsynth.ui_pi_observer(plant, fault_model=TURNING)
+    assert ROW not in {row.name for row in design.report.checks}
+    assert failed(design.replace(options={**design.options, "steady_error_limit": limit})) == {"options"}
+    with pytest.raises(obsynth.VerificationError, match="leave steady_error_limit out"):
+        obsynth.ui_pi_observer(plant, fault_model=TURNING, steady_error_limit=limit)
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_model_matching_has_no_limit_of_constant_faults(norm: str) -> None:
+    """Its estimate of a constant fault is another one: a limit in its file, or in a call, would be a false claim."""
+    plant = DescriptorSystem(
+        A=[[0.8]], Bf=[[0]], Bw=[[1, 0, 0]], C=[[1], [1]], Df=[[1], [0]], Dw=[[0, 0.5, 0], [0, 0, 1]], dt=1.0
+    )
+    matching = {"reference": ([[0.5]], [[1.0]], [[0.5]], [[0.0]]), "exact": False, "norm": norm}
+    design = obsynth.optimal_filter(plant, **matching)
+    assert "steady_error_limit" not in design.options
+    for limit in (5e-4, 2e-3, 0.5):
+        assert failed(design.replace(options={**design.options, "steady_error_limit": limit})) == {"options"}
+        with pytest.raises(obsynth.SpecError, match="steady_error_limit is for exact fault maps"):
+            obsynth.optimal_filter(plant, **matching, steady_error_limit=limit)
+
+
 def test_a_plant_that_adds_up_its_fault_is_judged_by_the_errors_alone() -> None:
     # The pole is on the boundary: the state has no end.
     plant = DescriptorSystem(A=[[1.0, 1.0], [0.0, 1.0]], C=np.eye(2), Bf=[[0.0], [1.0]], dt=1.0)

@@ -9,7 +9,7 @@ import obsynth
 from obsynth.errors import VerificationError
 from obsynth.files.outputs import require_distinct
 from obsynth.report.terminal.arguments import numbers_of, refuse_given
-from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, verified_again
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, progress, verified_again
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.results.design import unverified_mark
 
@@ -48,14 +48,16 @@ def run_report(options: argparse.Namespace) -> int:
         return _run_robustness(options)
     data = getattr(options, "data", None)
     if data is None:
-        own = ("gains", "unverified", "system", "out", "force", "json", "command")
+        own = ("gains", "unverified", "system", "out", "force", "json", "quiet", "command")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     from obsynth.report.page import PAGE, html_report
 
     scenario = None if options.system is None else obsynth.load_spec(options.system).scenario
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
-    design, report = verified_again(options.gains)
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage("verifying again")
+        design, report = verified_again(options.gains)
     design = design if report.passed else design.replace(report=report)
     run, watched = None, None
     if data is not None:
@@ -65,19 +67,21 @@ def run_report(options: argparse.Namespace) -> int:
         output_file(options.out, PAGE, options)
         watched = monitor_of(design, options, has_scenario=True)
         run = run_of(design, options, watched)
-    file = html_report(
-        design,
-        options.out,
-        report=report,
-        gains_file=str(options.gains),
-        scenario=scenario,
-        system_file=system,
-        run=run,
-        data_file=data,
-        statement="" if watched is None else watched.statement,
-        rows=getattr(options, "rows", None),
-        command=options.command,
-    )
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage("drawing the page")
+        file = html_report(
+            design,
+            options.out,
+            report=report,
+            gains_file=str(options.gains),
+            scenario=scenario,
+            system_file=system,
+            run=run,
+            data_file=data,
+            statement="" if watched is None else watched.statement,
+            rows=getattr(options, "rows", None),
+            command=options.command,
+        )
     if mark := unverified_mark(report):
         print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
     if options.system is not None and scenario is None:
@@ -90,7 +94,7 @@ def _run_robustness(options: argparse.Namespace) -> int:
     """Write what holds for every plant within its tolerances as a certificate."""
     refuse_given(
         options,
-        [name for name in vars(options) if name not in ("gains", "out", "force", "json", "command")],
+        [name for name in vars(options) if name not in ("gains", "out", "force", "json", "quiet", "command")],
         "the page: a certificate (.json) is of the gain set alone",
     )
     output_file(options.out, RESULT_FILE, options)

@@ -202,6 +202,7 @@ VERBS = {
             option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
             FORCE,
             JSON,
+            QUIET,
         ),
     ),
 }

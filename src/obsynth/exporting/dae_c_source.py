@@ -52,7 +52,9 @@ def write_dae_c(
     """Write source and header."""
     if target.suffix.lower() != ".c":
         raise SpecError(
-            f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).", path=str(target)
+            f"{target}: a recursive observer of a nonlinear plant has no constant matrices. Export it as C (.c) or "
+            "an FMU (.fmu).",
+            path=str(target),
         )
     require_no_sample_time(design, sample_time)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")

@@ -53,6 +53,9 @@ class ClaimMeaning:
     unit: str  # empty: dimensionless
     meaning: str
     row: str = ""
+    side: Literal["", "at most", "at least"] = (
+        ""  # from which it bounds what it is said of; printed numbers are rounded so
+    )
 
 
 @dataclass(frozen=True, eq=False)

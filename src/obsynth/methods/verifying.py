@@ -113,6 +113,13 @@ def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_
     row = constant_fault_row(constant_faults, float(limit), printed_digits)
     if row is not None:
         yield row
+    elif float(limit) != STEADY_ERROR:
+        yield nothing_wrong(
+            "options",
+            "what is claimed of constant faults is what steady_error_limit is for",
+            ["nothing is claimed of constant faults here: leave steady_error_limit out"],
+            source="options",
+        )
 
 
 def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:

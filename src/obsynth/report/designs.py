@@ -34,7 +34,16 @@ from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.report.plots.frequency import FaultGains, fault_gains
 from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
+from obsynth.results.layout import (
+    bound_number,
+    facts_table,
+    headed_table,
+    name_list,
+    number,
+    print_checks,
+    print_section,
+    upper_number,
+)
 from obsynth.results.registered import is_registered, registered
 from obsynth.verification.assumptions import Assumptions
 
@@ -180,10 +189,10 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     known = method_class(design.method).claims if design.method in REGISTRY else {}
     for name, value in design.certificate.claims.items():
         claim = known.get(name.partition("[")[0])
-        unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
+        unit, meaning, side = (claim.unit, claim.meaning, claim.side) if claim else ("", "unknown to this version", "")
         if not design.report.passed:
             meaning = f"{unproved(meaning)} (claimed only: checks fail)"
-        yield name.replace("_", " "), f"{number(value)} {unit}".strip(), meaning
+        yield name.replace("_", " "), f"{bound_number(value, side)} {unit}".strip(), meaning
     for check in design.report.checks:
         if check.name == "H-infinity norm":
             yield "norm", number(check.value), "the same gain recomputed by a second route"
@@ -215,8 +224,9 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
         return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
     if gains is None or not isinstance(plant, DescriptorSystem):
-        when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
-        return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
+        return ("parameter", f"deviation {deviation_time(plant)}"), [
+            (name, deviation(name, "-")) for name in observer.fault_names
+        ]
     linear = design.linear[1]
     none, noise = "by sampling" if plant.nw else "-", "deviation" if plant.is_discrete else "deviation at 1 sample/s"
     delays = ("delay", "delay in s") if plant.is_discrete else ()
@@ -229,10 +239,17 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         if plant.nd:
             gain = float(disturbance_gains.max())
             row += (
-                f"{number(gain)} from {plant.disturbance_names[int(disturbance_gains.argmax())]}" if gain else "none",
+                f"{upper_number(gain, digits=4)} from {plant.disturbance_names[int(disturbance_gains.argmax())]}"
+                if gain
+                else "none",
             )
         rows.append(row)
     return ("fault", *delays, noise, *(("largest gain",) if plant.nd else ())), rows
+
+
+def deviation_time(plant: Any) -> str:
+    """Return when the deviation of a recursive observer is that of its report."""
+    return "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
 
 
 def estimate_figures(design: ObserverDesign, gains: FaultGains | None) -> Iterator[dict[str, Any]]:
@@ -348,7 +365,8 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
     for name in observer.fault_names if plant.nd else ():
         number = plant.fault_names.index(name)
         other_faults = others(plant, number)
-        decoupled, among, either = decoupled_fault(plant, (), number), unknown, "either"
+        decoupled, among = decoupled_fault(plant, (), number), unknown
+        either = "either" if plant.nd == 1 else "any of them"
         if decoupled.shows_at(rest):
             if not other_faults or decoupled_fault(plant, other_faults, number).shows_at(rest):
                 continue

@@ -13,7 +13,13 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed, noise_words
-from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear, is_of_held_disturbances
+from obsynth.report.designs import (
+    deviation_time,
+    estimate_figures,
+    followed_steps,
+    gains_if_linear,
+    is_of_held_disturbances,
+)
 from obsynth.results.layout import duration, number, upper_number
 
 if TYPE_CHECKING:
@@ -105,6 +111,8 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
     steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
     units = design.plant.units
     timed = not isinstance(observer, LinearObserver) or observer.dt > 0.0
+    # Until its gain has settled an estimate has the deviation of the prior, and where the plant moves, another one.
+    when = "" if isinstance(observer, LinearObserver) else f" as they are {deviation_time(design.plant)}"
     held = ", if it is held between samples" if is_of_held_disturbances(design) else ""
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""
@@ -112,9 +120,10 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
         deviation = figures["deviation"]
         if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
             # In continuous time noise has an intensity: that of the stated deviations, once a second.
-            read = "" if timed else " if the sensors are read once a second, sqrt(T) of it if every T seconds"
+            if not timed:
+                when = " if the sensors are read once a second, sqrt(T) of it if every T seconds"
             sentence += (
-                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise}{read} "
+                f"{_bound(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise}{when} "
                 f"(false alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
             )
         else:

@@ -21,7 +21,7 @@ from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.modes import SETTLED_TO, transient
+from obsynth.observers.linear.modes import SETTLED_TO, settling_of_modes
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -46,7 +46,7 @@ from obsynth.report.designs import (
 from obsynth.report.plants import plain_table
 from obsynth.report.plots.frequency import FaultGains
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number, verdict_line
+from obsynth.results.layout import bound_number, lower_number, number, upper_number, verdict_line
 from obsynth.verification.constant_faults import CONSTANT_FAULT
 
 #: Faults, warnings and notes that are listed; the others are counted.
@@ -246,7 +246,7 @@ def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
             if design.report.passed
             else ("claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")
         )
-        yield label, f"{name} = {number(claims[name])}{unit}, {meaning}"
+        yield label, f"{name} = {bound_number(claims[name], known[name].side)}{unit}, {meaning}"
 
 
 def _dynamics(design: ObserverDesign) -> str:
@@ -254,29 +254,28 @@ def _dynamics(design: ObserverDesign) -> str:
     if isinstance(design.observer, WindowObserver):
         return f"the last {design.observer.samples} samples are used, and none before them"
     if isinstance(design.plant, DescriptorSystem):
-        seconds = transient(design.linear[1])
+        seconds = settling_of_modes(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
         # The whole response may take longer: where modes are alike, or large at first.
-        settling = f"the slowest mode falls to {100.0 * SETTLED_TO:g} % in {number(float(f'{seconds:.2g}'))} s"
+        settling = f"the slowest mode falls to {100.0 * SETTLED_TO:g} % in {upper_number(seconds)} s"
         return f"{settling}; observer of order {design.observer.order}"
-    if isinstance(design.observer, ScheduledObserver):
-        decay = design.certificate.claims.get("region_decay", math.nan)
-        if design.observer.dt == 0.0:
-            return f"errors decay by {number(decay)} 1/s at least; observer of order {design.observer.order}"
-        return (
-            f"errors shrink to {number(100.0 * decay)} % a sample at least; observer of order {design.observer.order}"
-        )
-    if isinstance(design.observer, RegionObserver):
-        decay = design.certificate.claims.get("region_decay", math.nan)
-        return f"errors decay by {number(decay)} 1/s at least; observer of order {design.observer.order}"
-    factor = design.certificate.claims.get("contraction", math.nan)
     order = f"observer of order {design.observer.order}"
+    if isinstance(design.observer, (RegionObserver, ScheduledObserver)):
+        decay = design.certificate.claims.get("region_decay", math.nan)
+        if isinstance(design.observer, RegionObserver) or design.observer.dt == 0.0:
+            return f"errors decay by {lower_number(decay, digits=4)} 1/s at least; {order}"
+        return f"errors shrink to {upper_number(100.0 * decay, digits=4)} % or less a sample; {order}"
+    factor = design.certificate.claims.get("contraction", math.nan)
     if not math.isfinite(factor):
         return order
     if factor < LEAST_CONTRACTION:
         return f"the error is gone after a few samples; {order}"
-    return f"the error decays by about {number(100.0 * (1.0 - factor), digits=2)} % per sample; {order}"
+    share = f"decays by about {number(100.0 * (1.0 - factor), digits=2)} % per sample"
+    if getattr(design.plant, "parameter_names", ()):
+        # How soon a parameter is followed is up to forgetting, random walk and excitation.
+        return f"the error of the states {share} where the parameters are known; {order}"
+    return f"the error {share}; {order}"
 
 
 def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
@@ -315,7 +314,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(model, str) and not of_states:
         yield f"faults that follow the model '{model}'"
     if is_guaranteed(design) and isinstance(design.plant, DescriptorSystem) and design.options.get("noise_bound"):
-        yield "noise within its stated bounds"
+        yield f"{'disturbances and noise within their' if design.plant.nd else 'noise within its'} stated bounds"
     elif isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
         if is_noise_assumed(design.plant.noise_names):
@@ -349,9 +348,10 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
         for j, name in enumerate(plant.disturbance_names):
             gain = float(gains.disturbance_gains[i, j])
             if gain >= UNSEPARATED_GAIN and units.get(fault) == units.get(name):
+                largest = upper_number(gain, digits=4)
                 yield (
-                    f"Disturbance {name} leaks into the estimate of {fault} (gain up to {number(gain, digits=3)}) and "
-                    "looks like a fault."
+                    f"Disturbance {name} leaks into the estimate of {fault} (gain up to {largest}) and looks like a "
+                    "fault."
                 )
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from decimal import ROUND_CEILING, Decimal
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from io import StringIO
 
 from rich import box
@@ -70,10 +70,27 @@ def number(value: float, *, digits: int = 4) -> str:
 
 def upper_number(value: float, *, digits: int = 3) -> str:
     """Return an upper bound with a few significant digits, the last rounded up: what is printed is a bound as well."""
-    if not math.isfinite(value) or value == 0.0:
+    return _rounded(value, ROUND_CEILING, digits)
+
+
+def lower_number(value: float, *, digits: int = 3) -> str:
+    """Return a lower bound with a few significant digits, the last rounded down: what is printed is a bound as well."""
+    return _rounded(value, ROUND_FLOOR, digits)
+
+
+def bound_number(value: float, side: str, *, digits: int = 4) -> str:
+    """Return a number that bounds another one from a side, ``"at most"`` or ``"at least"``, rounded away from that one;
+    any other to the nearest."""
+    rounding = {"at most": ROUND_CEILING, "at least": ROUND_FLOOR}.get(side)
+    return number(value, digits=digits) if rounding is None else _rounded(value, rounding, digits)
+
+
+def _rounded(value: float, rounding: str, digits: int) -> str:
+    if not is_number(value) or not math.isfinite(value) or value == 0.0:
         return number(value, digits=digits)
     exact = Decimal(repr(float(value)))
-    return number(float(exact.quantize(Decimal(1).scaleb(exact.adjusted() + 1 - digits), ROUND_CEILING)), digits=digits)
+    rounded = exact.quantize(Decimal(1).scaleb(exact.adjusted() + 1 - digits), rounding)
+    return number(float(rounded), digits=digits)
 
 
 def duration(seconds: float, *, digits: int = 3) -> str:
@@ -215,8 +232,15 @@ def shown_numbers(check: Check) -> tuple[str, str, str]:
     """Return value, bound and margin of a row; conditions that are true or false have none."""
     if check.kind == "condition" or check.name in YES_OR_NO:
         return ("", "", "")
-    value, bound, margin = (number(item) for item in (check.value, check.bound, check.margin))
-    return value, bound, margin
+    side = _proved_side(check)
+    return bound_number(check.value, side), bound_number(check.bound, side), number(check.margin)
+
+
+def _proved_side(check: Check) -> str:
+    """Return from which side what is proved is bounded by the numbers of a row; empty where nothing is."""
+    if check.status != "proved" or not check.passed or not check.margin > 0.0:
+        return ""
+    return "at most" if check.value < check.bound else "at least"
 
 
 def _numbers_and_verdict(check: Check) -> list[Text]:

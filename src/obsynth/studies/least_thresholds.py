@@ -184,8 +184,10 @@ def in_words(
     )
     if not np.isfinite(least):
         return f"{own}. The smallest possible threshold is not known."
+    if bound == 0.0:
+        return f"{own}, as neither disturbances nor noise of the scenario reach it."
     if least <= SAME_RESPONSE * bound:
-        return f"{own}. A test immune to disturbances and noise exists (guaranteed-test)."
+        return f"{own}. A test immune to the disturbances and noise of the scenario exists (guaranteed-test)."
     if bound < least:
         return (
             f"{own}: less than any test with its delay on at most {samples} samples of inputs and outputs has "

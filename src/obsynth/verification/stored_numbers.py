@@ -195,7 +195,8 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
     plant, observer = design.linear
     if not plant.nd or not observer.fault_names:
         return
-    system = _Composite(model)
+    # What a design lets through is no effect of rounding: it counts where its gain is claimed, or is to be zero.
+    system = _Composite(model, of_rounding=gamma is None and not model.decoupled)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     level = NOTICED if gamma is None else float(gamma) * (1.0 + GAIN_TOLERANCE)
     if gamma is None and system.is_plant_stable:
@@ -240,9 +241,10 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
 
 
 class _Composite:
-    """The transfer from the disturbances to the fault error of a plant and its stored observer, at any frequency."""
+    """The transfer from the disturbances to the fault error of a plant and its stored observer, at any frequency;
+    ``of_rounding``: of what the plant's state leaves of the identities alone."""
 
-    def __init__(self, model: ErrorModel) -> None:
+    def __init__(self, model: ErrorModel, *, of_rounding: bool = False) -> None:
         self.plant, self.observer = plant, observer = model.plant, model.observer
         rows, channel = observer.fault_rows, model.remainder
         self.lags = model.lag + 1
@@ -250,6 +252,8 @@ class _Composite:
         self.K, self.J = channel.K.midpoint[:, :width], channel.J.midpoint[rows, :width]
         self.driven = -model.disturbance
         self.direct = observer.Dy[rows] @ plant.Dd
+        if of_rounding:
+            self.driven, self.direct = 0.0 * self.driven, 0.0 * self.direct
         self.outputs = observer.Cz[rows]
         values = structure_of(plant).finite_eigenvalues
         self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)

@@ -14,6 +14,7 @@ from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.engines.recursive.checks import CLAIM_TOLERANCE, claims_row, failed_run, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
+from obsynth.numerics.outward import lower_text
 from obsynth.numerics.ranks import RANK_TOLERANCE, SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch
 from obsynth.observers.changed_options import plain_recursion
@@ -148,10 +149,15 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     deviations = facts.identifiable.deviations[observer.model.nx :]
     for name, prior, bound, deviation in zip(names, priors, deviations, facts.deviations, strict=True):
         unit = observer.model.units.get(name, "")
-        detail = "the outputs alone do not determine it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
+        detail = (
+            "from these outputs alone, with the start unknown and no process noise, the least deviation is "
+            f"{lower_text(bound, 3)} {unit} (Cramer-Rao)"
+            if np.isfinite(bound)
+            else "the outputs alone do not determine it"
+        )
         yield information(
             f"excitation: {name}",
-            "information from nominal constant inputs, in prior deviations to the power -2",
+            "information in the outputs of the nominal run, in prior deviations to the power -2",
             float((prior / bound) ** 2),
             source=f"{SOURCE}, (26)",
             detail=detail,
@@ -279,11 +285,16 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver, steps: int) 
     for name, claim, mean, count in (
         (
             "NEES",
-            f"squared errors of the {of} per degree of freedom are one, within a factor",
+            f"squared errors of the {of} per degree of freedom are one, within a factor of {CONSISTENCY_FACTOR:g}",
             float(np.mean(errors)),
             float(errors.size * (plant.nq or plant.nx)),
         ),
-        ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
+        (
+            "NIS",
+            f"squared innovations per degree of freedom are one, within a factor of {CONSISTENCY_FACTOR:g}",
+            squares / degrees,
+            degrees,
+        ),
     ):
         low, high = _band(count)
         bound = CONSISTENCY_FACTOR if mean >= 1.0 else 1.0 / CONSISTENCY_FACTOR
@@ -292,7 +303,7 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver, steps: int) 
             claim,
             mean,
             bound,
-            CONSISTENCY_FACTOR - _ratio(mean),
+            bound - mean if mean >= 1.0 else mean - bound,
             bool(_ratio(mean) <= CONSISTENCY_FACTOR),
             "recomputed, Monte Carlo with a fixed seed",
             "computed",

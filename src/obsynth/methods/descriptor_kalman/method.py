@@ -130,8 +130,11 @@ class DescriptorKalman(Method):
             "",
             "root mean square of all state errors over a region, averaged over the samples, for the stated noise",
             DEVIATION_ROW,
+            side="at most",
         ),
-        "region_decay": ClaimMeaning("", "factor a sample by which errors shrink over a region", DECAY_ROW),
+        "region_decay": ClaimMeaning(
+            "", "factor a sample by which errors shrink over a region", DECAY_ROW, side="at most"
+        ),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", *WITNESSES, *GAIN_WITNESSES})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"state despite noise"})

@@ -81,10 +81,16 @@ class DetectionFilterMethod(Method):
     source: ClassVar[str] = "Ding, Jeinsch, Frank, Ding 2000"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "disturbance_gain": ClaimMeaning(
-            "", "bound on the H-infinity norm from unknown inputs and noise to the residuals", "disturbance gain"
+            "",
+            "bound on the H-infinity norm from unknown inputs and noise to the residuals",
+            "disturbance gain",
+            side="at most",
         ),
         "fault_sensitivity": ClaimMeaning(
-            "", "least singular value from the faults to the residuals on the band: at least this", "fault sensitivity"
+            "",
+            "least singular value from the faults to the residuals on the band: at least this",
+            "fault sensitivity",
+            side="at least",
         ),
         "band_from": ClaimMeaning("rad/s", "where the band begins", "fault sensitivity"),
         "band_to": ClaimMeaning("rad/s", "where the band ends", "fault sensitivity"),

@@ -158,15 +158,20 @@ class FaultEstimationFilter(Method):
     summary: ClassVar[str] = "fault estimates with a bounded gain from the disturbances"
     source: ClassVar[str] = "Wang, Rodrigues, Theilliol, Shen 2015"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
-        "gamma": ClaimMeaning("", "proved bound on the L2 gain from disturbances to the fault-estimate error", "LMI"),
+        "gamma": ClaimMeaning(
+            "", "proved bound on the L2 gain from disturbances to the fault-estimate error", "LMI", side="at most"
+        ),
         "gamma_min": ClaimMeaning(
             "",
             "smallest gamma for this T, N and W (free weight: T and N); proved where 'least gain' says so",
             "least gain",
+            side="at least",
         ),
-        "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
-        "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
-        "region_decay": ClaimMeaning("", "factor by which errors decay in a sample, over the region", DECAY_ROW),
+        "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains", side="at least"),
+        "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains", side="at most"),
+        "region_decay": ClaimMeaning(
+            "", "factor by which errors decay in a sample, over the region", DECAY_ROW, side="at most"
+        ),
         "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
     }
     witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking", *WITNESSES}

@@ -50,6 +50,7 @@ from obsynth.methods.fault_estimation_filter.weights import least_by_weight, pri
 from obsynth.methods.method import Synthesis, silent
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.central_filter import LeastGain
+from obsynth.numerics.outward import upper_text
 from obsynth.observers.linear.means import averaged, unaveraged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -272,8 +273,8 @@ def _synthesised(
     if plant.nd and method.gamma is not None and level < method.gamma:
         remarks = (
             *remarks,
-            f"gamma = {method.gamma:.6g} was asked for, and {level:.6g} is proved: a larger gamma would only make the "
-            "gains worse conditioned.",
+            f"gamma = {method.gamma:.6g} was asked for, and {upper_text(level, 6)} is proved: a larger gamma would "
+            "only make the gains worse conditioned.",
         )
     return Synthesis(
         resolved,

@@ -123,7 +123,7 @@ class FunctionalFilter(Method):
     source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "order": ClaimMeaning("", "states of the filter", "order"),
-        "decay": ClaimMeaning("1/s", "slowest decay rate of the estimation error", "decay"),
+        "decay": ClaimMeaning("1/s", "slowest decay rate of the estimation error", "decay", side="at least"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}

@@ -152,16 +152,24 @@ class GuaranteedTestMethod(TestOptions, Method):
     summary: ClassVar[str] = "a test of one fault with the least threshold of all tests on these samples"
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
-        "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
-        "least": ClaimMeaning("", "no function of these samples estimates the fault to within less", "least"),
-        "surely_found": ClaimMeaning(
-            "", "a fault of this size and course is certain to alarm, on the nominal plant", "surely found"
+        "threshold": ClaimMeaning(
+            "", "never passed without the fault, in the fault's unit", "threshold", side="at most"
         ),
-        "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
+        "least": ClaimMeaning(
+            "", "no function of these samples estimates the fault to within less", "least", side="at least"
+        ),
+        "surely_found": ClaimMeaning(
+            "",
+            "a fault of this size and course is certain to alarm, on the nominal plant",
+            "surely found",
+            side="at most",
+        ),
+        "delay": ClaimMeaning("s", "after which it does so at the latest", "delay", side="at most"),
         "mean_threshold": ClaimMeaning(
             "",
             "mean over the shipped record of the threshold that holds for all constants in their tolerances",
             "mean threshold",
+            side="at most",
         ),
     }
     over_scenario: ClassVar[bool] = True

@@ -43,6 +43,7 @@ from obsynth.methods.guaranteed_test.windows import Window, disturbances_in_word
 from obsynth.methods.method import Synthesis
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import lower_text, upper_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.proofs.nearby_solutions import NearbySolution
@@ -348,10 +349,10 @@ def _notes(
     elif least is not None:
         kind = disturbances_in_words(window) if isinstance(problem.plant, DescriptorSystem) else ""
         words.append(
-            f"The threshold is {threshold:.4g}; the smallest possible with {test_problem.samples} samples is "
-            f"{least:.4g} (proved{f', for {kind}' if kind else ''}). "
+            f"The threshold is {upper_text(threshold)}; none with {test_problem.samples} samples is below "
+            f"{lower_text(least)} (proved{f', for {kind}' if kind else ''}). "
             + (
-                f"A fault of {2.0 * threshold:.4g} is certain to raise an alarm."
+                f"A fault of {upper_text(2.0 * threshold)} is certain to raise an alarm."
                 if mean is None
                 else f"This is for the nominal plant: over the tolerances it is {mean:.4g} in the mean of the scenario."
             )

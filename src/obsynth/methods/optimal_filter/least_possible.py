@@ -56,6 +56,7 @@ class LeastPossible(NamedTuple):
     least_deviation: float
     delay: tuple[int, ...] | None
     later_gain: float
+    is_noise_stated: bool = True
 
     @property
     def gain_share(self) -> float:
@@ -76,7 +77,8 @@ class LeastPossible(NamedTuple):
             said.append(f"gain {self.gain:.5g}; least of any causal filter {alike}: {least}")
             said += [] if np.isnan(self.later_gain) else [f"with one sample more: {later}"]
         if np.isfinite(self.deviation_share):
-            said.append(f"noise {self.deviation_share:.3g} times the least possible")
+            assumed = "" if self.is_noise_stated else ", if it is equal on every output (none is stated)"
+            said.append(f"noise {self.deviation_share:.3g} times the least possible{assumed}")
         return "; ".join(said)
 
 
@@ -124,6 +126,7 @@ def least_possible(design: ObserverDesign, *, later: bool = False) -> LeastPossi
         _least(measured, fault_map, "h2") if np.isfinite(deviation) else np.nan,
         delay,
         np.nan if after is None else _least(bounded, after, "hinf"),
+        bool(plant.nw),
     )
 
 

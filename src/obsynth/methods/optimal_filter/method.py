@@ -65,7 +65,7 @@ class OptimalFilterMethod(Method):
         search from there; the best filter is taken, and a note says whether its errors hold modes of the plant.
     steady_error_limit : float, optional
         Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
-        design beyond it is refused.
+        design beyond it is refused.  Not with ``exact=False``, which leaves such an error.
     name : str, optional
         Name of the design.
 
@@ -114,11 +114,18 @@ class OptimalFilterMethod(Method):
     summary: ClassVar[str] = "the least gain over all causal filters, with a bound that no filter beats"
     source: ClassVar[str] = "ours, after Hassibi, Sayed, Kailath 1999 and Varga 2017"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
-        "gain": ClaimMeaning("", "largest gain of this filter from the noise to the error", "gain"),
-        "least": ClaimMeaning("", "no causal filter with this fault map has a smaller gain", "least gain"),
-        "non_causal_limit": ClaimMeaning("", "no delay brings the gain below this", "gain at any delay"),
+        "gain": ClaimMeaning("", "largest gain of this filter from the noise to the error", "gain", side="at most"),
+        "least": ClaimMeaning(
+            "", "no causal filter with this fault map has a smaller gain", "least gain", side="at least"
+        ),
+        "non_causal_limit": ClaimMeaning(
+            "", "no delay brings the gain below this", "gain at any delay", side="at least"
+        ),
         "answer_limit": ClaimMeaning(
-            "", "gain of a filter from outputs that are others but for rounding, up to which least holds", "least gain"
+            "",
+            "gain of a filter from outputs that are others but for rounding, up to which least holds",
+            "least gain",
+            side="at least",
         ),
         "deviation": ClaimMeaning("", "root mean square of the error for white noise of unit intensity", "deviation"),
         "least_deviation": ClaimMeaning(
@@ -149,6 +156,11 @@ class OptimalFilterMethod(Method):
             yield "delay and reference both say what the estimate shall be of the faults: give one."
         if not self.exact and self.reference is None:
             yield "exact is False: model matching needs a reference model."
+        if not self.exact and self.steady_error_limit != STEADY_ERROR:
+            yield (
+                "steady_error_limit is for exact fault maps: model matching (exact is False) leaves an error of "
+                "constant faults, and proves no limit of it."
+            )
 
     def decoupled_names(self, plant: DescriptorSystem) -> tuple[str, ...]:
         """Return the disturbances that are decoupled; raise `SpecError` for names that the plant does not have."""

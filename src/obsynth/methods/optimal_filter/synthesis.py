@@ -245,8 +245,9 @@ def _made(
         "decoupled": [*plant.disturbance_names],
         "weights": plain_weights(method.weights, plant),
         "order_limit": method.order_limit,
-        "steady_error_limit": method.steady_error_limit,
     }
+    if fault_map.exact:
+        options["steady_error_limit"] = method.steady_error_limit
     solver = {
         "engine": "filtering Riccati equation",
         "added_noise": chosen.added_noise,

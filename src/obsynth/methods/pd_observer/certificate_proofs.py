@@ -21,6 +21,7 @@ import numpy as np
 
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import upper_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
@@ -158,7 +159,7 @@ def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: floa
         observer.Az, inputs, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
     )
     source = {"rate": "the rate of the faults", "noise": "noise and its derivative, as free inputs,"}[kind]
-    claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
+    claim = f"l2 gain from {source} to the fault error < {upper_text(gain, 6)}"
     return proof_row(f"LMI, {kind}", claim, proof, "ours: bounded real lemma")
 
 

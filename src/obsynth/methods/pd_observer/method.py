@@ -144,18 +144,28 @@ class PdObserver(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),
         "delta": ClaimMeaning("s", "the theorem's parameter in the certificate", "LMI"),
-        "decay": ClaimMeaning("1/s", "rate at which errors decay: imposed, proved (0: stability alone)", "LMI"),
+        "decay": ClaimMeaning(
+            "1/s", "rate at which errors decay: imposed, proved (0: stability alone)", "LMI", side="at least"
+        ),
         "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue", "disk"),
-        "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk"),
-        "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound"),
+        "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk", side="at most"),
+        "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound", side="at most"),
         "fault_rate_gain": ClaimMeaning(
-            "s", "bound on the l2 gain from the rate of the faults to the fault error: proved", "LMI, rate"
+            "s",
+            "bound on the l2 gain from the rate of the faults to the fault error: proved",
+            "LMI, rate",
+            side="at most",
         ),
         "noise_gain": ClaimMeaning(
-            "", "bound on the l2 gain from noise and its derivative to the fault error: proved", "LMI, noise"
+            "",
+            "bound on the l2 gain from noise and its derivative to the fault error: proved",
+            "LMI, noise",
+            side="at most",
         ),
-        "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved", "adaptation range"),
-        "adaptation_high": ClaimMeaning("", "to here", "adaptation range"),
+        "adaptation_low": ClaimMeaning(
+            "", "stable for every adaptation gain from here, proved", "adaptation range", side="at most"
+        ),
+        "adaptation_high": ClaimMeaning("", "to here", "adaptation range", side="at least"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
     imposed: ClassVar[frozenset[str]] = frozenset({"decay"})

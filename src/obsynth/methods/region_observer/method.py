@@ -122,11 +122,13 @@ class RegionObserverMethod(Method):
     summary: ClassVar[str] = "states and faults of nonlinear plants, proved over a region"
     source: ClassVar[str] = "Zemouche, Boutayeb 2013 (slopes); descriptor form ours"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
-        "region_decay": ClaimMeaning("1/s", "decay of the errors over the region", DECAY_ROW),
+        "region_decay": ClaimMeaning("1/s", "decay of the errors over the region", DECAY_ROW, side="at least"),
         "region_deviation": ClaimMeaning(
-            "", "root mean square of the errors that count, for white noise", DEVIATION_ROW
+            "", "root mean square of the errors that count, for white noise", DEVIATION_ROW, side="at most"
         ),
-        "region_gain": ClaimMeaning("", "L2 gain from the noises to the errors that count", REGION_GAIN_ROW),
+        "region_gain": ClaimMeaning(
+            "", "L2 gain from the noises to the errors that count", REGION_GAIN_ROW, side="at most"
+        ),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {*WITNESSES, *GAIN_WITNESSES, slope_name(WITNESSES), slope_name(GAIN_WITNESSES)}

@@ -137,7 +137,7 @@ class UiPiObserver(Method):
     summary: ClassVar[str] = "estimates of the state and the faults, decoupled from every unknown input"
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
-        "decay": ClaimMeaning("1/s", "slowest decay rate of the estimation error", "decay"),
+        "decay": ClaimMeaning("1/s", "slowest decay rate of the estimation error", "decay", side="at least"),
         "noise_amplification": ClaimMeaning(
             "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
         ),
@@ -154,7 +154,10 @@ class UiPiObserver(Method):
             "", "decay of the errors over a region: a factor a sample, or a rate in 1/s", DECAY_ROW
         ),
         "region_gain": ClaimMeaning(
-            "", "l2 gain over a region from what drives the fault models to the fault errors", REGION_GAIN_ROW
+            "",
+            "l2 gain over a region from what drives the fault models to the fault errors",
+            REGION_GAIN_ROW,
+            side="at most",
         ),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(

@@ -56,7 +56,13 @@ def is_stable(observer: LinearObserver) -> bool:
 
 
 def transient(observer: LinearObserver) -> float:
-    """Return the settling time of an observer in seconds: after it the slowest mode has decayed to `SETTLED_TO`."""
+    """Return the settling time of an observer in seconds: after it the slowest mode has decayed to `SETTLED_TO` in the
+    estimates, which are as late as their delays."""
+    return settling_of_modes(observer) + observer.dt * max((*observer.state_delays, *observer.fault_delays), default=0)
+
+
+def settling_of_modes(observer: LinearObserver) -> float:
+    """Return after how many seconds the slowest mode has decayed to `SETTLED_TO`."""
     if observer.order == 0:
         return 0.0
     slowest = abscissa(observer.Az, observer.dt)
@@ -65,9 +71,7 @@ def transient(observer: LinearObserver) -> float:
     if slowest >= 1.0:
         return math.inf
     samples = math.ceil(math.log(SETTLED_TO) / math.log(slowest)) if slowest > 0.0 else 0
-    return observer.dt * (
-        max(samples, _steps_remembered(observer.Az)) + max((*observer.state_delays, *observer.fault_delays), default=0)
-    )
+    return observer.dt * max(samples, _steps_remembered(observer.Az))
 
 
 def _steps_remembered(Az: FloatArray) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, real_number, real_vector
+from obsynth.numerics.arguments import is_number, real_number, real_vector, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation
@@ -73,6 +73,12 @@ def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSyst
         return MatrixSequence.of(np.eye(size), name)
     if is_number(value):
         value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
+    if isinstance(value, str) and size != 1:
+        raise SpecError(
+            f"{name} is the text {shown(value)}: give a number, or the rows of a {size} by {size} matrix; its entries "
+            "may be texts.",
+            path=name,
+        )
     sequence = MatrixSequence.of(value, name, constants=plant.constants)
     if sequence.length is not None and (plant.horizon is None or sequence.length < plant.horizon):
         raise SpecError(

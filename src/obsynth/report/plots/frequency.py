@@ -13,6 +13,7 @@ from obsynth.numerics.arguments import arguments_checked, chosen
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
+from obsynth.numerics.outward import upper_text
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.modes import GRID_REACH, frequency_grid
@@ -259,7 +260,9 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
         panel.plot(gains.frequencies, _positive(gains.least), label="faults, least singular value", **_LEAST_LINE)
     gamma = design.certificate.claims.get("gamma")
     if to == "faults" and gamma is not None and "disturbances" in gains.gains:
-        panel.plot(gains.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
+        panel.plot(
+            gains.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {upper_text(gamma)}", **_BOUND
+        )
     plain_decades(panel)
     plain_decades(panel, across=True)
     panel.set_xlabel("frequency (rad/s)")
