@@ -122,3 +122,24 @@ def test_where_no_method_is_right_at_constant_faults_none_is_named() -> None:
     for other in ("functional-filter", "fault-estimation-filter", "optimal-filter"):
         with pytest.raises(obsynth.ObsynthError):
             obsynth.design(plant, other)
+
+
+def test_gains_that_rounding_moves_too_far_are_refused_with_the_error_that_they_reach() -> None:
+    """The fault of a chain of masses is seen by 1e-5 within a sample: rounding moves the estimate by a thousandth."""
+    stiffness = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
+    masses = DescriptorSystem(
+        A=np.block([[np.zeros((3, 3)), np.eye(3)], [-stiffness, -0.1 * stiffness]]),
+        C=np.eye(6)[:2],
+        Bf=np.eye(6)[:, 5:],
+        Dw=0.001 * np.eye(2),
+    )
+    plant = obsynth.discretise(masses, 0.1)
+    with pytest.raises(VerificationError, match=r"may miss .* of a constant fault, above 0\.001 ") as error:
+        obsynth.fault_estimation_filter(plant)
+    assert "badly scaled" not in str(error.value)
+    (offered,) = re.findall(r"With steady_error_limit=([0-9.e-]+), which was tried", str(error.value))
+    limit = float(offered)
+    design = obsynth.fault_estimation_filter(plant, steady_error_limit=limit)
+    assert 1e-3 < design.report["constant fault"].value <= limit
+    (instead,) = re.findall(r"([a-z-]+) was tried with its defaults and is verified", str(error.value))
+    assert obsynth.design(plant, instead).report.passed

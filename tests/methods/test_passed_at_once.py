@@ -7,8 +7,8 @@ import pytest
 
 import obsynth
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
+from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.methods.optimal_filter.passed_at_once import _answer, _shown_at_once, with_digits_of, without_white_noise
-from obsynth.methods.optimal_filter.realisation import Followed
 
 NX, STILL = 4, 2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -44,6 +45,9 @@ from obsynth.verification.stored_numbers import StoredErrors
 #: Two plants are one where the entries of each matrix agree to this share of its largest: rounding of an elimination in
 #: units of its own, or of a sampling that is done again.
 SAME_PLANT = 1e-9
+
+#: Gains whose estimates may miss more of a constant fault are not offered with a larger steady_error_limit.
+LARGEST_STEADY_ERROR = 0.1
 
 
 @arguments_checked
@@ -243,11 +247,26 @@ def _designed_on(
     try:
         return verified(plant, method.id, synthesis, name=name, recovery=recovery)
     except VerificationError as error:
-        if not advise or error.report is None or {row.name for row in error.report.failures} != {CONSTANT_FAULT}:
+        report = error.report
+        if not (advise and isinstance(report, VerificationReport) and _misses_constant_faults_alone(report)):
             raise
         progress("searching for a method that estimates constant faults of this plant")
-        instead = _right_at_constant_faults(plant, method, name, recovery)
-        raise VerificationError(f"{error} {instead}", report=error.report) from None
+        advice = [_right_at_constant_faults(plant, method, name, recovery)]
+        enough = _error_that_is_reached(report[CONSTANT_FAULT].value)
+        if enough is not None and "steady_error_limit" in synthesis.options:
+            relaxed = replace(synthesis, options={**synthesis.options, "steady_error_limit": enough})
+            with suppress(ObsynthError):
+                verified(plant, method.id, relaxed, name=name, recovery=recovery)
+                advice.append(f"With steady_error_limit={enough:g}, which was tried, these gains are verified.")
+        raise VerificationError(" ".join([str(error), *advice]), report=report) from None
+
+
+def _error_that_is_reached(missed: float) -> float | None:
+    """Return what estimates of constant faults miss, in two digits rounded up; ``None`` where that is too much."""
+    if not missed <= LARGEST_STEADY_ERROR:
+        return None
+    digit = 10.0 ** (math.floor(math.log10(missed)) - 1)
+    return float(f"{math.ceil(missed / digit) * digit:.2g}")
 
 
 def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery: StateRecovery | None) -> str:
@@ -433,12 +452,7 @@ def verified(
     notes = require_above_rounding(*draft.linear) if linear else ()
     report = verify(draft)
     if not report.passed:
-        raise VerificationError(
-            f"Gains were found, but the shipped realisation fails: {failed_rows(report)}. Nothing was shipped; "
-            "the plant may be badly scaled, or the options may be at the limit of what is possible: relax them."
-            + "".join(f" {note}" for note in draft.notes),
-            report=report,
-        )
+        raise VerificationError(" ".join([_what_fails(report), *draft.notes]), report=report)
     uncertain = draft.plant.uncertainty if isinstance(draft.plant, DescriptorSystem) else None
     if uncertain is not None and uncertain.lost:
         notes = (
@@ -449,6 +463,24 @@ def verified(
             "obsynth.eliminate_algebraic_states).",
         )
     return draft.replace(report=report, notes=(*draft.notes, *notes))
+
+
+def _what_fails(report: VerificationReport) -> str:
+    """Return which rows the gains fail, and why where that is known, as the beginning of a message."""
+    if _misses_constant_faults_alone(report):
+        row = report[CONSTANT_FAULT]
+        return (
+            f"Gains were found, but in the end they may miss {row.value:.3g} of a constant fault, above "
+            f"{row.bound:.3g} (steady_error_limit), {row.detail}. Nothing was shipped."
+        )
+    return (
+        f"Gains were found, but the shipped realisation fails: {failed_rows(report)}. Nothing was shipped; "
+        "the plant may be badly scaled, or the options may be at the limit of what is possible: relax them."
+    )
+
+
+def _misses_constant_faults_alone(report: VerificationReport) -> bool:
+    return {row.name for row in report.failures} == {CONSTANT_FAULT}
 
 
 @arguments_checked

@@ -11,7 +11,7 @@ import scipy.linalg
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed, designed
-from obsynth.methods.optimal_filter.realisation import Followed
+from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
@@ -39,7 +39,7 @@ ZERO_LEVELS = (1.0, 1e1, 1e2, 1e3, 1e4)
 #: Slacks of the inequality that the certificate solves, of the square of the output matrix.
 SLACKS = (1e-3, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 #: A deviation that comes out otherwise than in the search, by this share, is that of rounding where it is small.
-ROUNDING_OF_DEVIATIONS = 1e-7
+ROUNDING_OF_DEVIATIONS = 3e-7
 #: A bound this near the gain, as a share of it, is not improved further: the search of the gain ends at 1e-8.
 CLOSE_ENOUGH = 3e-8
 #: What is claimed of a proved bound: machines differ in the last digits of the combination that they find.

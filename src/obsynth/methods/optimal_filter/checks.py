@@ -10,7 +10,13 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed, least_deviation_of_every_start
+from obsynth.methods.optimal_filter.fault_maps import (
+    ZERO_GAIN,
+    FaultMap,
+    designed,
+    least_deviation_of_every_start,
+    response_at,
+)
 from obsynth.methods.optimal_filter.realisation import with_modes
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
@@ -278,31 +284,18 @@ def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int
     Each estimate is judged beside the largest entry of its own row, each fault in a unit that suits the plant.  The
     points are more than the difference has states.
     """
-    plant, observer, reference, delay = model.plant, model.observer, fault_map.reference, fault_map.delay or 0
-    late = np.array(fault_map.delays or (0,) * plant.nf)
+    plant, observer = model.plant, model.observer
     c, df, _, _ = model.output(slice(0, len(observer.Cz)))
-    own = 0 if reference is None else len(reference[0])
-    count = 2 * (observer.order + own + delay) + 3
-    if plant.is_discrete:
-        points = np.exp(1j * (np.arange(count) + 0.5) * np.pi / count)
-    else:
-        size = max(float(np.max(np.abs(np.linalg.eigvals(observer.Az)), initial=0.0)), 1.0) if observer.order else 1.0
-        points = 1j * size * np.tan((np.arange(count) + 0.5) * np.pi / (2 * count))
+    points = fault_map.at_points(plant, observer.Az)
     units = PlantUnits.of(plant).faults
     worst, largest = np.zeros(len(c)), np.zeros(len(c))
-    for point in points:
-        response = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
-        wanted = np.diag(point**-late) if reference is None else _response(reference, point)
+    for point, wanted in points:
+        response = df - response_at((observer.Az, model.fault, c, 0.0 * df), point)
         # What is no number stays none, and fails.
         worst = np.maximum(worst, np.max(np.abs(response - wanted) * units, axis=1, initial=0.0))
         largest = np.maximum(largest, np.max(np.abs(wanted) * units, axis=1, initial=0.0))
     sizes = np.where(largest > 0.0, largest, np.max(largest, initial=0.0) or 1.0)
-    return float(np.max(worst / sizes, initial=0.0)), count
-
-
-def _response(system: Model, point: complex) -> Any:
-    a, b, c, d = system
-    return c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d if len(a) else d
+    return float(np.max(worst / sizes, initial=0.0)), len(points)
 
 
 def _least(design: ObserverDesign, plant: DescriptorSystem) -> Check:

@@ -101,6 +101,24 @@ class FaultMap(NamedTuple):
             return plant
         return weighted_plant(plant, noise=self.weights.noise, faults=self.weights.faults)
 
+    def at_points(self, plant: DescriptorSystem, states: FloatArray) -> list[tuple[complex, ComplexArray]]:
+        """Return what faults shall be in the estimates, at more points than the difference to a filter has states.
+
+        ``states``: the filter's A.
+        """
+        reference, order = self.reference, len(states)
+        late = np.array(self.delays or (0,) * plant.nf)
+        own = 0 if reference is None else len(reference[0])
+        count = 2 * (order + own + (self.delay or 0)) + 3
+        if plant.is_discrete:
+            points = np.exp(1j * (np.arange(count) + 0.5) * np.pi / count)
+        else:
+            size = max(float(np.max(np.abs(np.linalg.eigvals(states)), initial=0.0)), 1.0) if order else 1.0
+            points = 1j * size * np.tan((np.arange(count) + 0.5) * np.pi / (2 * count))
+        return [
+            (point, np.diag(point**-late) if reference is None else response_at(reference, point)) for point in points
+        ]
+
     def later(self, samples: int = 1, *, which: tuple[bool, ...] | None = None) -> FaultMap:
         """Return the map with more samples of delay, of all faults or of some."""
         delays = self.delays or ()
@@ -140,6 +158,12 @@ class Designed(NamedTuple):
     def is_nothing(self) -> bool:
         """Whether the gain is zero but for rounding."""
         return self.gain <= self.nothing
+
+
+def response_at(system: Model, point: complex) -> Any:
+    """Return the transfer of a system at a point."""
+    a, b, c, d = system
+    return c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d if len(a) else d
 
 
 def conditions(plant: DescriptorSystem, options: Options) -> tuple[Condition, ...]:

@@ -14,7 +14,8 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.realisation import Followed, left_kernel_of
+from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.realisation import left_kernel_of
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model

@@ -7,15 +7,17 @@ modes of the plant that die out by themselves and that it reads are followed by 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError
+from obsynth.methods.optimal_filter.common_numbers import with_common_numbers
+from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.low_order_models import plainly_truncated
@@ -46,23 +48,6 @@ ROUNDED_MODE = 1e-12
 BALANCING_SWEEPS = 5
 #: Equations are solved so many times, each time for what is left: small rows of a filter keep their digits.
 SOLUTIONS = 3
-
-
-class Followed(NamedTuple):
-    """A filter ``z+ = A z + B y``, rows ``C z + D y``, copies of modes included, with T and T0.
-
-    Where u alone acts on the plant, ``z = T E xa``, xa the state with its last ``lag`` ones, and the rows are zero:
-    ``A T E + B C = T Aa``, ``C T E + D C = T0 Aa``, ``T0 E = 0``; with ``Bd`` in place of u's columns likewise.
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    T: FloatArray
-    T0: FloatArray
-    lag: int
-    undriven: int = 0  # so many last states are copies of modes that no known input drives
 
 
 def minimal(filter_: Model, *, discrete: bool | None = None) -> Model:
@@ -147,11 +132,27 @@ def _cleaned(matrix: FloatArray, share: float = ROUNDING_SHARE) -> FloatArray:
     return np.where(np.abs(matrix) > share * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
-def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) -> Followed:
+def followed(
+    plant: DescriptorSystem,
+    filters: Sequence[Model],
+    longest: int,
+    *,
+    finished: Callable[[Followed], Followed],
+) -> Followed:
     """Return the first of some realisations of a filter that follows the plant; raise `SolverError` where none does.
 
-    ``plant``: with the disturbances that are decoupled; ``longest``: the most past states that T may be on.
+    ``plant``: with the disturbances that are decoupled; ``longest``: the most past states that T may be on;
+    ``finished``: what is done to the digits of one.
     """
+    follower = _first_followed(plant, filters, longest, finished)
+    if follower.lag or _is_followed(plant, follower):
+        return follower
+    return with_common_numbers(plant, follower) or follower
+
+
+def _first_followed(
+    plant: DescriptorSystem, filters: Sequence[Model], longest: int, finished: Callable[[Followed], Followed]
+) -> Followed:
     none = np.zeros((0, plant.nx)), np.zeros((0, 0))
     copies = _dying_modes(plant)
     lags = ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1)))
@@ -165,10 +166,16 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
                 # Copies that are hardly read were left out, of which a filter that follows little else has much.
                 continue
             if follower is not None and share == IDENTITIES_LEFT[0]:
-                return follower
+                return finished(follower)
             less_exact = less_exact or follower
+        if lag == 0 and rows is none[0] and less_exact is None:
+            for filter_ in filters:
+                nearly, _ = _followed(plant, filter_, *none, 0, exactly=False)
+                follower = None if nearly is None else with_common_numbers(plant, finished(nearly))
+                if follower is not None and _is_followed(plant, follower):
+                    return follower
     if less_exact is not None:
-        return less_exact
+        return finished(less_exact)
     raise SolverError(
         "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
         "(sensor_noise), or give a longer delay."
@@ -258,10 +265,16 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 
 def _followed(
-    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int
+    plant: DescriptorSystem,
+    filter_: Model,
+    copied: FloatArray,
+    moved: FloatArray,
+    lag: int,
+    *,
+    exactly: bool = True,
 ) -> tuple[Followed | None, float]:
     """Return a filter beside copies ``copied`` of modes, with T and T0, and the share of `IDENTITIES_LEFT` to which
-    every equation holds; ``None`` where one misses all of them."""
+    every equation holds; ``None`` where one misses all of them, ``exactly`` or beside the largest of all terms."""
     a, b, c, d = filter_
     e, own, _, dd_past = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
@@ -290,7 +303,10 @@ def _followed(
     wanted = np.concatenate([(one @ other).ravel() for one, other in products])
     terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
     heights = nz * na, nz * plant.nd, rows * na
-    solution, share = _cleaned_solution(system, (wanted, terms_wanted), heights, na, plant.nd)
+    if exactly:
+        solution, share = _cleaned_solution(system, (wanted, terms_wanted), heights, na, plant.nd)
+    else:
+        solution, share = _nearly_a_solution(system, (wanted, terms_wanted)), IDENTITIES_LEFT[-1]
     if solution is None:
         return None, share
     t, into, s, c_past = (
@@ -361,6 +377,14 @@ def _cleaned_solution(
         else:
             return solution, share
     return None, IDENTITIES_LEFT[-1]
+
+
+def _nearly_a_solution(system: FloatArray, wanted: tuple[FloatArray, FloatArray]) -> FloatArray | None:
+    """Return the solution that misses no equation by more than a share of the largest term of all."""
+    solution, _ = _solved(system, wanted[0])
+    largest = np.max(np.abs(system) @ np.abs(solution) + wanted[1], initial=0.0)
+    missed = np.max(np.abs(system @ solution - wanted[0]), initial=0.0)
+    return solution if missed <= IDENTITIES_LEFT[-1] * (1.0 + largest) else None
 
 
 def _solved(system: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,6 +15,7 @@ from obsynth.errors import InfeasibleError, PreconditionError, SolverError, coun
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
+from obsynth.methods.optimal_filter.common_numbers import with_fault_map
 from obsynth.methods.optimal_filter.delays import delays_of, in_words, is_auto, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import (
@@ -26,6 +28,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     on_plant,
     unit_of_gains,
 )
+from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.methods.optimal_filter.lasting_modes import (
     ADDED_DRIVES,
     with_growing_modes_reached,
@@ -34,7 +37,7 @@ from obsynth.methods.optimal_filter.lasting_modes import (
 from obsynth.methods.optimal_filter.late_outputs import shows_later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
-from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations, without_undriven
+from obsynth.methods.optimal_filter.realisation import followed, observer_of, realisations, without_undriven
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order, free_filters
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.optimal_filter.weights import plain_weights
@@ -43,6 +46,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import with_late_inputs
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.standard_form import cayley, uncayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -351,18 +355,16 @@ def _with_enough_noise(
     while True:
         try:
             follower, observer, missed = _realised(plant, chosen, norm)
-            exact = chosen.fault_map.exact and bool(more)
-            missed = missed if exact else 0.0
             # Noise that carries none, beside undriven modes, would count in the mean square of this plant.
-            if more and norm == "h2" and not plant.is_discrete and not chosen.fault_map.undriven:
+            if norm == "h2" and not plant.is_discrete and not chosen.fault_map.undriven:
                 missed = max(missed, _lost_share(plant, chosen, follower, observer))
-            if missed <= EXACT_SHARE:
-                return chosen, follower, observer
             if best is None or missed < best[0]:
                 best = missed, (chosen, follower, observer)
         except SolverError:
-            if not more:
+            if not more and best is None:
                 raise
+        if best is not None and (best[0] <= EXACT_SHARE or not more):
+            return best[1]
         try:
             chosen = designed(plant, chosen.fault_map, norm, more)
         except PreconditionError as error:
@@ -400,20 +402,36 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
     white = norm == "h2" and not plant.is_discrete
     if white:
         ways = without_white_noise(plant, fault_map, ways)
-    follower = followed(plant, ways, problem.window + problem.shift)
-    follower = with_digits_of(plant, fault_map, follower) if white else follower
-    rows = len(follower.C)
-    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-    observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
-    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
-    if not model.missed() <= IDENTITY_SHARE:
+    finished = partial(with_digits_of, plant, fault_map) if white else _unchanged
+    follower = followed(plant, ways, problem.window + problem.shift, finished=finished)
+    observer, missed_identities, missed = _followed_by(plant, fault_map, follower)
+    if not missed_identities <= IDENTITY_SHARE:
         raise SolverError(
             "The numbers of the filter of least gain follow the plant by rounding only, as none of its outputs shows "
             f"its states by more: the result is inconclusive. Take norm: {'hinf' if norm == 'h2' else 'h2'}, or a "
             "reference model of a hundredth of the bandwidth: either gave a filter where this was seen."
         )
-    missed = fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
+    if missed > EXACT_SHARE:
+        exact = with_fault_map(plant, fault_map, follower)
+        own, missed_identities, less = _followed_by(plant, fault_map, exact)
+        if missed_identities <= IDENTITY_SHARE and less < missed:
+            return exact, own, less
     return follower, observer, missed
+
+
+def _followed_by(
+    plant: DescriptorSystem, fault_map: FaultMap, follower: Followed
+) -> tuple[LinearObserver, float, float]:
+    """Return the observer of a filter, and by which shares it misses what it follows and an exact fault map."""
+    rows = len(follower.C)
+    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
+    observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
+    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
+    return observer, model.missed(), fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
+
+
+def _unchanged(follower: Followed) -> Followed:
+    return follower
 
 
 class _Row(NamedTuple):
@@ -502,10 +520,16 @@ def _notes(
         listed = "; ".join(f"delay {_late(row)}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
         notes.append(f"Least gain, and least deviation for white noise of unit intensity, by delay: {listed}.")
     if chosen.added_noise:
+        quiet = not decide_rank(plant.Dw, expected=plant.ny).full
+        why = (
+            "An output, or a combination of outputs, has no noise"
+            if quiet
+            else "With less noise than is added here the equations were not solved, or lost digits"
+        )
+        gap = "" if options.norm == "h2" and not quiet else f" {_gap(plant, chosen, options, claims)}"
         notes.append(
-            "An output, or a combination of outputs, has no noise: the filter is the one for "
-            f"{chosen.added_noise:g} of the plant's own sizes more on every output. "
-            + _gap(plant, chosen, options, claims)
+            f"{why}: the filter is the one for {chosen.added_noise:g} of the plant's own sizes more on every "
+            f"output.{gap}"
         )
     if chosen.is_nothing and options.norm == "hinf":
         notes.append(
