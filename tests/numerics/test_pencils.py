@@ -7,6 +7,7 @@ from scipy.linalg import block_diag, eigvals
 from obsynth import DescriptorSystem
 from obsynth.numerics import pencil_points as pencils
 from obsynth.numerics.pencils import finite_zeros, reduced, structure_of_reduced
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.pencil import regularity_of, structure_of
 
 
@@ -332,3 +333,29 @@ def test_zero_behind_a_long_chain_is_as_clear_as_the_pencil_is_there():
         found = finite_zeros(np.vstack([np.eye(n + 1), 0.0 * C]), np.vstack([turn.T @ A @ turn, C]))
         assert found.values == pytest.approx([0.4])
         assert all(decision.clear for decision in found.decisions)
+
+
+@pytest.mark.parametrize("outputs", [3, 90])
+def test_points_of_a_large_pencil_with_a_badly_conditioned_derivative_are_judged_as_by_all_singular_values(outputs):
+    # Pairs and real modes; hidden are a pair, and a real one six times, which is more directions than are looked for at
+    # first.  E spans seven decades, so that its inverse serves no Schur form.
+    rng = np.random.default_rng(outputs)
+    n = 100
+    a = np.diag(-np.arange(1.0, n + 1.0))
+    for i in range(0, 40, 2):
+        a[i, i + 1], a[i + 1, i], a[i + 1, i + 1] = 3.0, -3.0, a[i, i]
+    c = rng.uniform(0.5, 1.5, (outputs, n))
+    c[:, :2] = 0.0
+    a[70:76, 70:76], c[:, 70:76] = -71.0 * np.eye(6), 0.0
+    left, right = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+    e = left @ np.diag(np.geomspace(1.0, 1e-7, n)) @ right
+    E, A = np.vstack([e, np.zeros((outputs, n))]), np.vstack([e @ right.T @ a @ right, c @ right])
+    scales = float(np.linalg.norm(E, 2)), float(np.linalg.norm(A, 2))
+    points = pencils.PencilPoints(E, A, scales)
+    hidden = {-1.0 + 3.0j: 1, -71.0 + 0.0j: 6}
+    for place in (*hidden, -3.0 + 3.0j, -50.0 + 0.0j, -99.0 + 0.0j, 0.7 + 0.0j):
+        values = np.linalg.svd(A - place * E, compute_uv=False)
+        lost = int(np.sum(values <= RANK_TOLERANCE * (scales[1] + abs(place) * scales[0])))
+        assert points.nullity(place) == points.rank(place).expected - points.rank(place).rank == lost
+        assert lost == hidden.get(place, 0)
+        assert np.isclose(points.rank(place).singular_values[-1], values[-1], rtol=0.1, atol=1e-14 * scales[1])
