@@ -22,6 +22,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.recursive.steady_observer import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
@@ -138,7 +139,11 @@ def candidate(
     begun = perf_counter()
     try:
         in_own_time = continuous or known.time == "continuous"
-        made = maker(plant if in_own_time else sampled, method, options)
+        designed_for: Any = plant if in_own_time else sampled
+        if not in_own_time and plant.dt > 0.0 and plant.nx > sampled.nx:
+            # With the way back to the algebraic states, which are estimated as well.
+            designed_for = eliminate_algebraic_states(plant)
+        made = maker(designed_for, method, options)
         observer = _sampled(made, sampled.dt)
     except ObsynthError as error:
         return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))

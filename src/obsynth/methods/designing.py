@@ -124,9 +124,14 @@ def design(
     notes = plant.notes if isinstance(plant, Transformation) else ()
     own, recovery = plant_and_recovery(plant, recovery)
 
-    def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
-        configured = method_class(method).of(options)
-        each = partial(_designed, name=name, recovery=recovery, progress=report_stage, advise=advise)
+    def made(
+        plant: Plant | Transformation, method: str, options: Mapping[str, Any], *, advise: bool = False
+    ) -> ObserverDesign:
+        configured, way_back = method_class(method).of(options), recovery
+        if isinstance(plant, Transformation):
+            way_back = plant.recovery if recovery is None else recovery.then(plant.recovery)
+            plant = plant.plant
+        each = partial(_designed, name=name, recovery=way_back, progress=report_stage, advise=advise)
         uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
         if configured.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
             each = partial(each, more={"scenario": scenario})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeAlias
@@ -23,9 +23,11 @@ from obsynth.observers.recursive.batches import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
 from obsynth.simulation.over_region import scenario_runs_over_region, scheduled_parameters
@@ -184,7 +186,39 @@ def drawn_designs(design: ObserverDesign, count: int, seed: int) -> list[Observe
 
 
 def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
-    """Return a design and a scenario, ready to run."""
+    """Return a design and a scenario, ready to run.
+
+    A scenario may say where states of the plant as written begin: those that were eliminated follow from the others.
+    """
+    known = getattr(design.plant, "state_names", ())
+    written = () if design.recovery is None else design.recovery.names
+    eliminated = [name for name in scenario.initial_state if name in written and name not in known]
+    if not eliminated:
+        return _bench_of(design, scenario)
+    kept = {name: value for name, value in scenario.initial_state.items() if name not in eliminated}
+    bench = _bench_of(design, scenario.replace(initial_state=kept))
+    return replace(bench, notes=(*bench.notes, *_other_beginnings(design, scenario, eliminated, bench)))
+
+
+def _other_beginnings(
+    design: ObserverDesign, scenario: Scenario, eliminated: Sequence[str], bench: Bench
+) -> Iterator[str]:
+    """Yield what a scenario says of states that follow from others, where it shows that they begin elsewhere."""
+    recovery, plant = design.recovery, design.plant
+    if recovery is None or not isinstance(plant, DescriptorSystem):
+        return
+    begins = bench.signals.at_begin[0]
+    follows = recovery.from_state @ bench.initial_state + recovery.from_input @ begins[: plant.nu]
+    follows = follows + recovery.from_fault @ begins[plant.nu : plant.nu + plant.nf]
+    for name in eliminated:
+        i = recovery.names.index(name)
+        begin, stated = number(follows[i]), number(scenario.initial_state[name])
+        if begin != stated and not recovery.from_disturbance[i].any():
+            yield f"{name} follows from the other states: it begins at {begin}, not at {stated}."
+
+
+def _bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return a design and a scenario of the states of its plant, ready to run."""
     if isinstance(design.observer, LinearObserver):
         return make_bench(design, scenario)
     if isinstance(design.observer, WindowObserver):
