@@ -140,6 +140,18 @@ def _summary_of_design(design: Any) -> Any:
     return summary(design)
 
 
+def _text_of_simulation(simulation: Any) -> str:
+    from obsynth.report.scenarios import simulation_text
+
+    return simulation_text(simulation)
+
+
+def _text_of_methods(methods: Any) -> str:
+    from obsynth.report.plants import methods_text
+
+    return methods_text(methods)
+
+
 def _monitor_in_c(monitor: Any, design: Any, seconds: float | None = None) -> Any:
     from obsynth.monitoring.exporting import monitor_in_c
 
@@ -196,6 +208,8 @@ register(
     plot_least_thresholds=_plot_least_thresholds,
     problem_of_options=_problem_of_options,
     summary_of_design=_summary_of_design,
+    text_of_methods=_text_of_methods,
+    text_of_simulation=_text_of_simulation,
 )
 # Rooms on data and on many designs may be left out: the design half is whole without them.
 if find_spec("obsynth.monitoring") is not None:
@@ -209,6 +223,24 @@ if find_spec("obsynth.studies") is not None:
     register(robustness=_robustness, run_many=_run_many)
 
 
+#: What other libraries call functions of this one.
+_OTHER_NAMES = {
+    **dict.fromkeys(("kalman", "kalman_filter", "KalmanFilter", "lqe", "dlqe"), "descriptor_kalman"),
+    **dict.fromkeys(("ekf", "EKF", "ExtendedKalmanFilter"), "extended_kalman"),
+    **dict.fromkeys(("uio", "UIO", "unknown_input_observer", "place", "pi_observer"), "ui_pi_observer"),
+    **dict.fromkeys(("luenberger", "luenberger_observer", "observer"), "pd_observer"),
+    **dict.fromkeys(("hinf", "hinf_filter", "h2_filter"), "optimal_filter"),
+    **dict.fromkeys(("fault_detection", "residual_generator", "parity", "parity_space"), "detection_filter"),
+    **dict.fromkeys(("ss", "dss", "StateSpace", "Plant", "System", "LTI"), "DescriptorSystem"),
+    **dict.fromkeys(("c2d", "sample", "sample_system"), "discretise"),
+    **dict.fromkeys(("lmi", "lmis"), "conditions"),
+    **dict.fromkeys(("plot", "plots"), "plotting"),
+    **dict.fromkeys(("load_gains", "load_design", "read"), "load"),
+    "save": "ObserverDesign.save",
+    "report": "html_report",
+}
+
+
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC_HOMES:
         return getattr(import_module(_PUBLIC_HOMES[name]), name)
@@ -217,6 +249,8 @@ def __getattr__(name: str) -> Any:
     from obsynth.numerics.suggestions import suggestion
 
     close = suggestion(name, __all__) if not name.startswith("_") else ""
+    if name in _OTHER_NAMES:
+        close = f" Did you mean {_OTHER_NAMES[name]!r}?"
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}.{close}".removesuffix("."))
 
 

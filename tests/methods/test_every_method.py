@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -131,6 +132,9 @@ def test_a_design_is_verified_and_survives_its_file(method: str, tmp_path: Path)
     assert design.report.passed
     again = obsynth.load(design.save(tmp_path / "gains.json"))
     assert obsynth.verify(again).passed
+    # It goes to other processes as it goes to files.
+    sent = pickle.loads(pickle.dumps(design)).save(tmp_path / "sent.json")
+    assert sent.read_bytes() == (tmp_path / "gains.json").read_bytes()
     here, there = (obsynth.run_on_data(one, log_of(one)).table for one in (design, again))
     pd.testing.assert_frame_equal(here, there, check_exact=True)
 

@@ -366,7 +366,7 @@ def test_a_log_without_stamps_takes_those_that_are_told(tmp_path: Path) -> None:
 
 
 def test_the_summary_lists_alarms_and_rows_that_could_not_alarm() -> None:
-    from obsynth.monitoring.verbs.data_arguments import summary_of_run
+    from obsynth.monitoring.run_summary import summary_of_run
 
     data = log(rows=160)
     data.loc[60:80, "a"] += 1.0

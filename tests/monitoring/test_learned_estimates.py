@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.monitoring.alarms.events import NOT_DISTINGUISHED_YET, alarm_rows
+from obsynth.monitoring.run_summary import summary_of_run
 from obsynth.monitoring.thresholds.learned_levels import (
     SETTLING,
     conformal_levels,
@@ -36,7 +37,6 @@ from obsynth.monitoring.thresholds.parameter_scores import (
     parameter_walk,
     sample_score,
 )
-from obsynth.monitoring.verbs.data_arguments import summary_of_run
 from obsynth.numerics.autoregression import fitted_autoregression
 
 SCORED = ("score", "information", "theta", "deviations")

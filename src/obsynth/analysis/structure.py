@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.zeros import unstable_poles
+from obsynth.files.tables import text_table
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import on_one_thread_if_small
@@ -27,6 +28,9 @@ _FAR_EIGENVALUE = 3.0
 
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
 _QUESTIONS_UP_TO = 200
+
+#: Eigenvalues that a text lists; of more the first and last ones.
+_MOST_SHOWN = 12
 
 #: Signals that a question lists.
 _MOST_QUESTIONED = 5
@@ -52,6 +56,25 @@ class Structure:
     causally_observable: bool  # ``rank [E; C] = nx``
     rank_of_E: RankDecision
     decisions: Mapping[str, RankDecision]
+
+    def __repr__(self) -> str:
+        """Return what a reader wants to know in lines; the evidence is among the ``decisions``."""
+        words = {True: "yes", False: "no"}
+        regular = "regular" if self.regular else "NOT regular"
+        modes = np.array2string(np.array(self.unobservable_modes), precision=4, threshold=_MOST_SHOWN)
+        facts = {
+            "pencil": f"{regular}, {'no index' if self.index is None else f'index {self.index}'}",
+            "E": self.rank_of_E.describe(),
+            "finite eigenvalues": np.array2string(self.finite_eigenvalues, precision=4, threshold=_MOST_SHOWN),
+            "stable": words[self.stable],
+            "impulse-free": words[self.impulse_free],
+            "observable": "yes" if self.finitely_observable else f"no: {modes}",
+            "detectable": words[self.detectable],
+            "impulse observable": words[self.impulse_observable],
+            "rank [E; C] = nx": words[self.causally_observable],
+        }
+        facts |= {"unclear ranks": ", ".join(self.unclear)} if self.unclear else {}
+        return "\n".join(text_table([("structure", ""), *facts.items()]))
 
     @property
     def unclear(self) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
-from obsynth.results.verification_report import VerificationReport, failed_rows
+from obsynth.results.verification_report import MethodReports, VerificationReport, failed_rows
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
 from obsynth.verification.constant_faults import CONSTANT_FAULT
@@ -293,9 +293,7 @@ def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery:
 
 
 @arguments_checked
-def check(
-    plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None
-) -> dict[str, VerificationReport]:
+def check(plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None) -> MethodReports:
     """Return, for every method, the report of its existence conditions; what fails is a row.
 
     Nothing is designed but for a plant over a region (`PolytopicSystem`): where its points have observers, a small one
@@ -312,7 +310,8 @@ def check(
     Returns
     -------
     dict of str to VerificationReport
-        By method id; a design by the method can exist where ``passed`` is true.
+        By method id; a design by the method can exist where ``passed`` is true.  Its text says for each method whether
+        one can, or the first condition that fails.
 
     Raises
     ------
@@ -352,11 +351,11 @@ def check(
             signals=error.signals,
             of_the_method=error.condition == "index",
         )
-        return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
+        return MethodReports((method, VerificationReport.of(condition_rows((row,)))) for method in REGISTRY)
 
 
-def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
-    reports = {}
+def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> MethodReports:
+    reports = MethodReports()
     for method in REGISTRY:
         known = method_class(method)
         stated = options.get(method, known.placeholders)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import math
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -63,6 +64,26 @@ def read_only(array: NDArray[Any], dtype: Any = np.float64) -> NDArray[Any]:
     copy = np.array(array, dtype=dtype, order="C", copy=True)
     copy.setflags(write=False)
     return copy
+
+
+def read_only_mapping(items: Mapping[str, Any]) -> MappingProxyType[str, Any]:
+    """Return a private mapping that nobody can write to, nor to the arrays in it."""
+    for value in items.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+    return MappingProxyType(dict(items))
+
+
+# Python does not pickle read-only mappings, nor copy them deeply: records that hold some go to other processes.
+copyreg.pickle(MappingProxyType, lambda mapping: (read_only_mapping, (dict(mapping),)))
+
+
+def restore(record: Any, state: Mapping[str, Any]) -> None:
+    """Give a record that was pickled, or copied deeply, its fields; arrays are read-only again."""
+    for name, value in state.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(record, name, value)
 
 
 def freeze(record: Any, *names: str, **values: Any) -> None:

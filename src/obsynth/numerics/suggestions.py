@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from inspect import Parameter, signature
 from typing import Any, ParamSpec, TypeVar
@@ -37,6 +37,20 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     if not close and len(str(name)) >= LEAST_BEGINNING:
         close = [other for other in known if other.startswith(str(name))][:3]
     return f" Did you mean {' or '.join(repr(shortened(other)) for other in close)}?" if close else ""
+
+
+def no_attribute(owner: object, name: str, elsewhere: Mapping[str, str]) -> AttributeError:
+    """Return Python's error for an attribute that an object lacks, with where it is or which one may be meant.
+
+    ``elsewhere``: what to write instead of an attribute, by name.
+    """
+    text = f"{type(owner).__name__!r} object has no attribute {name!r}"
+    if name.startswith("_"):
+        return AttributeError(text)
+    if name in elsewhere:
+        return AttributeError(f"{text}: write {elsewhere[name]}")
+    close = suggestion(name, [other for other in dir(owner) if not other.startswith("_")])
+    return AttributeError(f"{text}.{close}" if close else text)
 
 
 def shortened(name: str) -> str:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, read_only, restore
 from obsynth.numerics.quantities import numbers_in_units
 from obsynth.numerics.sparse import dense, is_sparse, same_matrix
+from obsynth.numerics.suggestions import no_attribute
 from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, exact_numbers
 from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, plant_fields
-from obsynth.plants.other_names import plant_keywords_suggested
+from obsynth.plants.other_names import ELSEWHERE, plant_keywords_suggested
 from obsynth.plants.resized import with_what_follows
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
@@ -301,6 +302,14 @@ class DescriptorSystem:
         if same and "exact" not in changes:
             object.__setattr__(new, "exact", self.exact)
         return new
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        restore(self, state)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            raise no_attribute(self, name, ELSEWHERE)
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

@@ -11,6 +11,9 @@ Given = ParamSpec("Given")
 
 Returned = TypeVar("Returned")
 
+#: Attributes of a linear plant that other libraries call otherwise.
+_ATTRIBUTES = ("dt", "Bf", "Bd", "Bw", "state_names", "output_names", "input_names", "fault_names")
+
 #: What is meant by each of these names.
 OTHER_NAMES = {
     **dict.fromkeys(("Ts", "ts", "T", "h", "sample_time", "sampling_time", "time_step", "step", "period"), "dt"),
@@ -25,6 +28,24 @@ OTHER_NAMES = {
     **dict.fromkeys(("begin", "onset", "from"), "start"),
     **dict.fromkeys(("stop", "until"), "end"),
     **dict.fromkeys(("magnitude", "value"), "size"),
+}
+
+
+#: What to write instead of an attribute that a linear plant does not have.
+ELSEWHERE = {
+    **{other: f"plant.{name}" for other, name in OTHER_NAMES.items() if name in _ATTRIBUTES and other != "step"},
+    **dict.fromkeys(
+        ("poles", "eigenvalues", "is_stable", "stable", "index", "observable", "is_observable", "detectable"),
+        "obsynth.analyse_structure(plant)",
+    ),
+    **dict.fromkeys(
+        ("sample", "discretise", "discretize", "to_discrete", "c2d"), "obsynth.discretise(plant, sample_time)"
+    ),
+    "simulate": "obsynth.simulate(plant, scenario)",
+    "design": "obsynth.design(plant)",
+    "check": "obsynth.check(plant)",
+    "diagnose": "obsynth.diagnose(plant)",
+    **dict.fromkeys(("add_fault", "add_faults", "with_faults"), "plant.replace(Bf=...)"),
 }
 
 

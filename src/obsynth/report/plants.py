@@ -22,7 +22,15 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check
-from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
+from obsynth.results.layout import (
+    checks_table,
+    complex_numbers,
+    facts_table,
+    headed_table,
+    name_list,
+    print_section,
+    printed,
+)
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.plant import PLANT_MATRICES
 
@@ -232,6 +240,12 @@ def method_lines(
             yield method, f"{_verdict(failed)} for this plant{own_method}: {_reason(failed)}", "bold red"
     if others:
         yield "for other kinds of plants", ", ".join(others), "dim"
+
+
+def methods_text(methods: Mapping[str, VerificationReport]) -> str:
+    """Return what ``print(obsynth.check(plant))`` shows."""
+    over_region = any(_OVER_REGION in {check.name for check in report.checks} for report in methods.values())
+    return printed(lambda console: print_methods(methods, own="", over_region=over_region, console=console))
 
 
 def print_methods(

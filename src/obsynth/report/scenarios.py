@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.results.layout import duration, headed_table, number, print_section
+from obsynth.results.layout import duration, headed_table, number, print_section, printed
 
 if TYPE_CHECKING:
     from obsynth.simulation.simulate import Simulation
@@ -27,6 +27,11 @@ def worst_rows(title: str, rows: list[Any], size: Callable[[Any], float]) -> tup
     if len(rows) <= SHOWN_ROWS:
         return title, rows
     return f"{title}: the worst {SHOWN_ROWS} of {len(rows)}", sorted(rows, key=lambda row: -size(row))[:SHOWN_ROWS]
+
+
+def simulation_text(simulation: Simulation) -> str:
+    """Return what ``print(simulation)`` shows."""
+    return printed(lambda console: simulation_report("Simulation", simulation, console=console, units={}))
 
 
 def simulation_report(

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError, VerificationError
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
-from obsynth.numerics.suggestions import fields_suggested
+from obsynth.numerics.suggestions import fields_suggested, no_attribute
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
@@ -38,6 +38,23 @@ if TYPE_CHECKING:
 OfObserver = TypeVar("OfObserver")
 
 OfPlant = TypeVar("OfPlant")
+
+#: What to write instead of an attribute that a design does not have.
+ELSEWHERE = {
+    "claims": "design.certificate.claims",
+    "summary": "print(design)",
+    **dict.fromkeys(("poles", "eigenvalues"), "design.to_control().poles()"),
+    **dict.fromkeys(("A", "B", "C", "D", "ss", "to_ss", "to_statespace"), "design.to_control() or design.to_scipy()"),
+    "verify": "obsynth.verify(design)",
+    "simulate": "obsynth.simulate(design, scenario)",
+    "evaluate": "obsynth.evaluate(design, scenario)",
+    "run": "obsynth.run_on_data(design, log)",
+    "monitor": "obsynth.monitor(design, scenario)",
+    "export": "obsynth.export(design, 'observer.c')",
+    "plot": "obsynth.plotting.plot_poles(design)",
+    **dict.fromkeys(("html", "to_html", "page"), "obsynth.html_report(design)"),
+    "to_json": "design.save(path)",
+}
 
 #: Checks that a mark names; the others are counted.
 _MOST_NAMED_CHECKS = 4
@@ -68,6 +85,11 @@ class Certificate:
 
     matrices: Mapping[str, FloatArray]
     claims: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        claims = ", ".join(f"{name} = {value:.6g}" for name, value in self.claims.items())
+        shapes = ", ".join(f"{name} {matrix.shape}" for name, matrix in self.matrices.items())
+        return f"<Certificate: claims {claims or 'none'}; matrices {shapes or 'none'}>"
 
     def __post_init__(self) -> None:
         freeze(self, "claims", matrices={name: read_only(matrix) for name, matrix in self.matrices.items()})
@@ -201,6 +223,14 @@ class ObserverDesign:
         if not isinstance(self.plant, plant) or not isinstance(self.observer, observer):
             raise SpecError(f"Design {self.name!r} is no {what}.", path="observer")
         return self.plant, self.observer
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            own = {letter: f"design.gains[{letter!r}]" for letter in self.__dict__.get("gains", ())}
+            if "certificate" in self.__dict__:
+                own |= {claim: f"design.certificate.claims[{claim!r}]" for claim in self.certificate.claims}
+            raise no_attribute(self, name, ELSEWHERE | own)
 
     def __repr__(self) -> str:
         """Return name, method and verdict in one line; ``print(design)`` shows the summary."""

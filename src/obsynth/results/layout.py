@@ -6,7 +6,7 @@ Text is always a `rich.text.Text`, so that brackets in names are no markup; a ve
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from io import StringIO
 
@@ -271,12 +271,17 @@ def verdict_line(checks: Sequence[Check]) -> Text:
     return Text(text, style="bold red")
 
 
-def report_text(checks: Sequence[Check]) -> str:
-    """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
+def printed(report: Callable[[Console], None]) -> str:
+    """Return what a report prints on a console, as plain text."""
     console = Console(file=StringIO(), width=TEXT_WIDTH, markup=False, highlight=False, emoji=False, color_system=None)
-    print_checks(checks, console=console)
+    report(console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+def report_text(checks: Sequence[Check]) -> str:
+    """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
+    return printed(lambda console: print_checks(checks, console=console))
 
 
 def worth(check: Check) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.results.checks import Check, all_hold
+from obsynth.results.registered import registered
 
 
 @fields_suggested
@@ -86,6 +87,13 @@ class VerificationReport:
         """
         require_kind(data, dict, "data", "what as_dict() returns")
         return cls.of(Check(**row) for row in data["checks"])
+
+
+class MethodReports(dict[str, VerificationReport]):
+    """Reports by method id: a dictionary whose text says for each method whether a design can exist, or why not."""
+
+    def __repr__(self) -> str:
+        return str(registered("text_of_methods")(self))
 
 
 def failed_rows(report: VerificationReport) -> str:

@@ -24,6 +24,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
+from obsynth.results.registered import registered
 from obsynth.simulation.benches import bench_of, rows_without_claim
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import simulate_plant, simulate_time_varying
@@ -105,6 +106,10 @@ class Simulation:
 
     def __post_init__(self) -> None:
         freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))
+
+    def __repr__(self) -> str:
+        """Return the errors of all estimates as a table."""
+        return str(registered("text_of_simulation")(self))
 
     @property
     def fault_errors(self) -> FloatArray:

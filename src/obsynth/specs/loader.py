@@ -95,6 +95,10 @@ class Spec:
     noise: Mapping[str, Any] | None = None
     inputs: Mapping[str, Any] | None = None
 
+    def __repr__(self) -> str:
+        scenario = "" if self.scenario is None else f", scenario of {self.scenario.horizon:g} s"
+        return f"<Spec {self.name!r} ({self.path}): {self.plant!r}, method {self.method}{scenario}>"
+
     def input_delay(self, plant: Any) -> int | None:
         """Return rows by which a log's inputs act later than a plant takes them; ``None`` where the spec says nothing.
 

@@ -141,6 +141,12 @@ class Evaluation:
     fault_rmse: Mapping[str, Interval]
     state_rmse: Mapping[str, Interval]
 
+    def __repr__(self) -> str:
+        """Return rates, delays and errors as tables."""
+        from obsynth.studies.tables import evaluation_text
+
+        return evaluation_text(self)
+
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
         data: dict[str, Any] = {}

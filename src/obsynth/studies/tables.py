@@ -14,7 +14,7 @@ from rich.text import Text
 
 from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
 from obsynth.report.scenarios import worst_rows
-from obsynth.results.layout import headed_table, number, print_section
+from obsynth.results.layout import headed_table, number, print_section, printed
 
 if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor
@@ -51,6 +51,11 @@ _NAME_COLUMNS = ("method", "fault")
 _NAME_WIDTH, _HEADING_WIDTH = 11, 8
 
 
+def evaluation_text(evaluation: Evaluation) -> str:
+    """Return what ``print(evaluation)`` shows."""
+    return printed(lambda console: evaluation_report("Evaluation", evaluation, monitor=None, console=console, units={}))
+
+
 def evaluation_report(
     name: str,
     evaluation: Evaluation,
@@ -64,15 +69,16 @@ def evaluation_report(
     share = f"{100.0 * evaluation.confidence:g} % interval"
     console.print(Text(f"{name}: {evaluation.runs} runs", style="bold"))
     console.print()
-    if monitor is not None:
+    decided = {key: item for key in _DECISIONS if (item := getattr(evaluation, key)).count}
+    if monitor is not None or decided:
         table = headed_table("decisions", "value", share, "of", "unit")
-        for key, (title, unit) in _DECISIONS.items():
-            item: Interval = getattr(evaluation, key)
-            if item.count:
-                table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
-        kind, statement = described(monitor)
-        print_section(console, f"Monitor {kind}", table)
+        for key, item in decided.items():
+            title, unit = _DECISIONS[key]
+            table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
+        print_section(console, "Monitor" if monitor is None else f"Monitor {described(monitor)[0]}", table)
+    if monitor is not None:
         end = final_threshold(monitor)
+        _, statement = described(monitor)
         size = "" if end is None else f" ({number(end)} at the end of a run)"
         if not isinstance(monitor, ParameterMonitor) and monitor.rule.adapts:
             size = " (it adapts to the signals of each run)"

@@ -119,6 +119,12 @@ class DataRun:
     statement: str = ""
     stuck: Mapping[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Return rows, alarms and warnings in a few lines."""
+        from obsynth.monitoring.run_summary import text_of_run
+
+        return text_of_run(self)
+
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {

@@ -185,6 +185,12 @@ class LearnedThresholds:
     ranges: LearnedRanges | None = None
     memory: float = 0.0
 
+    def __repr__(self) -> str:
+        """Return what the thresholds mean, and what is monitored, in a few lines."""
+        lines = [f"{self.statement[0].upper()}{self.statement[1:]}.", f"Monitored: {', '.join(self.columns)}."]
+        lines += [f"Left out: {', '.join(self.left_out)}."] if self.left_out else []
+        return "\n".join([*lines, *self.notes])
+
     @property
     def holds(self) -> bool:
         """Whether there were rows enough for the rate that was asked for, and rows that were not learned from are in

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
-from obsynth.files.tables import text_table
 from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, refuse_idle
 from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
 from obsynth.monitoring.verbs.run_progress import health, rows_done
-from obsynth.plants.signal_names import listed
 from obsynth.report.terminal.arguments import STREAM, columns_of, flag_of, numbers_of, refuse_given
 from obsynth.report.terminal.specs import require_same_signals, required_scenario
 
@@ -153,32 +150,3 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
         sample_time=options.sample_time,
         **monitor_settings(design, options),
     )
-
-
-def summary_of_run(run: DataRun, watched: Monitor | None, units: Mapping[str, str] | None = None) -> str:
-    """Return what a run was, in a few lines; ``units``: of the plant's signals, by name."""
-    from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence, time_in_alarm
-
-    counts = ", ".join(f"{count} {status}" for status, count in run.statuses.items())
-    lines = [f"{run.rows} rows: {counts}."]
-    if run.recovered:
-        states = [f"{name} ({kind.replace('needs', 'with')})" for name, kind in run.recovered.items()]
-        lines.append(f"Also estimated, of the plant as written: {listed(states)}.")
-    if run.outliers:
-        listed_outliers = ", ".join(f"{count} of {name}" for name, count in run.outliers.items())
-        count = sum(run.outliers.values())
-        lines.append(f"{count} outlier{'s' if count != 1 else ''}: {listed_outliers}.")
-    for name, time in run.alarms.items():
-        first = next((event for event in run.events if event.by == name), None)
-        clear = watched is not None and name == watched.kind and first is not None and first.clear
-        fault = f" Probable fault: {first.fault}." if clear and first is not None else ""
-        by = f"threshold of {name}" if name in run.thresholds else f"monitor: {name}"
-        lines.append(f"First alarm {run.stamps.shown(time)} ({by}).{fault}")
-    rows, more = alarm_rows(run.events, run.stamps.shown, units)
-    table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
-    lines += [*(f"  {line}" for line in table), *alarm_notes(run.events), *time_in_alarm(run.events, run.rows)]
-    if watched is not None or run.thresholds:
-        lines += silence(run, watched.kind if watched else "any threshold")
-    if watched is not None:
-        lines.append(f"The {watched.kind} threshold: {watched.statement}.")
-    return "\n".join(lines)

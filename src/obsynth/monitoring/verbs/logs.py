@@ -9,8 +9,9 @@ from typing import TextIO
 
 from obsynth.errors import SpecError
 from obsynth.files.outputs import require_distinct
+from obsynth.monitoring.run_summary import summary_of_run
 from obsynth.monitoring.verbs.alarm_proofs import alarm_of_run, certificate_target, proof_of
-from obsynth.monitoring.verbs.data_arguments import monitor_of, protect_inputs, run_of, summary_of_run
+from obsynth.monitoring.verbs.data_arguments import monitor_of, protect_inputs, run_of
 from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
 from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, print_json
 from obsynth.report.terminal.pictures import picture_kind, written_picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, real_array, require_kind, require_shape, shown
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, restore
 from obsynth.numerics.suggestions import fields_suggested
 from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
@@ -85,6 +86,17 @@ class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     state_delays: tuple[int, ...]
     fault_delays: tuple[int, ...]
     constant: FloatArray | None = None
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        restore(self, state)
+
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.dt > 0.0 else "continuous"
+        return (
+            f"<LinearObserver of order {self.order}, {time}: from {len(self.input_names)} inputs and "
+            f"{len(self.output_names)} outputs to {len(self.state_names)} states, {len(self.fault_names)} faults and "
+            f"{len(self.residual_names)} residuals>"
+        )
 
     def __post_init__(self) -> None:
         for field in NAME_FIELDS:

@@ -149,7 +149,11 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
 
 def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = ()) -> str:
     """Return what was done to a plant of which ``count`` states are left, in words."""
-    done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
+    done = (
+        f"eliminated {counted(plant.nx - count, 'algebraic state')}"
+        if count < plant.nx
+        else "multiplied by the inverse of E"
+    )
     if not dropped:
         return done
     return f"left out {counted(len(dropped), 'variable')} without an effect ({', '.join(dropped)}); {done}"

@@ -107,6 +107,9 @@ class Transformation:
     bounds: SolutionBounds | None = None
     is_of_lower_index: bool = False
 
+    def __repr__(self) -> str:
+        return f"<Transformation: {self.description or 'nothing changed'}; plant: {self.plant!r}>"
+
     def with_tolerances(self, kind: str, size: float = 0.0) -> Transformation:
         """Return the step with the tolerances of its source carried on to its plant."""
         before = self.source.uncertainty
