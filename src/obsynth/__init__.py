@@ -164,6 +164,12 @@ def _bound_of_monitor(monitor: Any, observer: Any) -> Any:
     return bound_of_monitor(monitor, observer)
 
 
+def _text_of_run(run: Any) -> str:
+    from obsynth.monitoring.run_summary import text_of_run
+
+    return text_of_run(run)
+
+
 def _page_sections_of_run(*arguments: Any) -> Any:
     from obsynth.monitoring.page_sections import page_sections_of_run
 
@@ -174,6 +180,12 @@ def _detections(*arguments: Any) -> Any:
     from obsynth.monitoring.page_sections import detections
 
     return detections(*arguments)
+
+
+def _text_of_evaluation(evaluation: Any) -> str:
+    from obsynth.studies.tables import evaluation_text
+
+    return evaluation_text(evaluation)
 
 
 def _run_many(options: Any) -> int:
@@ -218,9 +230,10 @@ if find_spec("obsynth.monitoring") is not None:
         detections=_detections,
         monitor_in_c=_monitor_in_c,
         page_sections_of_run=_page_sections_of_run,
+        text_of_run=_text_of_run,
     )
 if find_spec("obsynth.studies") is not None:
-    register(robustness=_robustness, run_many=_run_many)
+    register(robustness=_robustness, run_many=_run_many, text_of_evaluation=_text_of_evaluation)
 
 
 #: What other libraries call functions of this one.

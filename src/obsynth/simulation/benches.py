@@ -27,7 +27,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
 from obsynth.simulation.over_region import scenario_runs_over_region, scheduled_parameters
@@ -204,6 +203,8 @@ def _other_beginnings(
     design: ObserverDesign, scenario: Scenario, eliminated: Sequence[str], bench: Bench
 ) -> Iterator[str]:
     """Yield what a scenario says of states that follow from others, where it shows that they begin elsewhere."""
+    from obsynth.results.layout import number
+
     recovery, plant = design.recovery, design.plant
     if recovery is None or not isinstance(plant, DescriptorSystem):
         return

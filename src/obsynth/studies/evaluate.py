@@ -24,6 +24,7 @@ from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_r
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.design import ObserverDesign
+from obsynth.results.registered import registered
 from obsynth.simulation.benches import Bench, Runs, bench_of, drawn_designs, make_bench
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.simulate import aligned_errors
@@ -143,9 +144,7 @@ class Evaluation:
 
     def __repr__(self) -> str:
         """Return rates, delays and errors as tables."""
-        from obsynth.studies.tables import evaluation_text
-
-        return evaluation_text(self)
+        return str(registered("text_of_evaluation")(self))
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""

@@ -35,6 +35,7 @@ from obsynth.numerics.arguments import arguments_checked, require_kind, whole_nu
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.results.registered import registered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,9 +122,7 @@ class DataRun:
 
     def __repr__(self) -> str:
         """Return rows, alarms and warnings in a few lines."""
-        from obsynth.monitoring.run_summary import text_of_run
-
-        return text_of_run(self)
+        return str(registered("text_of_run")(self))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
