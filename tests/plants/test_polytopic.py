@@ -102,6 +102,7 @@ def test_vertices_alone_are_scheduled_by_their_weights() -> None:
         ({"A": [["k"]], "E": [["k"]]}, {"k": [1, 2]}, PreconditionError, "Solve the equations"),
         ({"A": [["k + j"]]}, {"k": [1, 2]}, SpecError, "'j' is no scheduling parameter"),
         ({"A": [[1.0]]}, {"k": [1, 2]}, SpecError, "No entry depends on 'k'"),
+        ({"A": [["0.5 * pi"]]}, {"pi": [1, 2]}, SpecError, "'pi' is a number in expressions"),
         ({"A": [["k"]]}, {}, SpecError, "must name one or more"),
         ({"C": [["k"]]}, {"k": [1, 2]}, SpecError, "no matrix A"),
     ],
@@ -111,6 +112,13 @@ def test_what_is_no_plant_over_a_region_is_refused_by_name(
 ) -> None:
     with pytest.raises(error, match=told):
         PolytopicSystem(plant=plant, scheduling=scheduling)
+
+
+def test_no_vertex_and_no_parameter_are_refused() -> None:
+    with pytest.raises(SpecError, match="vertices are empty"):
+        PolytopicSystem([])
+    with pytest.raises(SpecError, match="that are given: none; give k"):
+        PolytopicSystem(plant={"A": [["k"]], "C": [[1]]}, scheduling={"k": [0, 1]}).at({})
 
 
 def test_too_many_functions_are_refused() -> None:

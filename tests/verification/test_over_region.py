@@ -337,6 +337,20 @@ def _random_region(seed: int, *, outputs: int = 2) -> PolytopicSystem:
     return PolytopicSystem([obsynth.DescriptorSystem(np.eye(3), A + v * turn, **shared, dt=1.0) for v in (-1.0, 1.0)])
 
 
+@pytest.mark.parametrize("rate", [1e-9, 0.1, 1e9])
+def test_a_rate_keeps_a_gain_of_zero(rate: float) -> None:
+    plant = PolytopicSystem(
+        plant={
+            "A": [["0.5 + 0.3 * v", 0.1], [0, 0.8]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0.5]], "Bd": [[0.3], [1]],
+            "dt": 1.0,
+        },
+        scheduling={"v": {"range": [-1, 1], "rate": rate}},
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    assert design.certificate.claims["gamma_min"] == 0.0
+    assert not any("is not used" in note for note in design.notes)
+
+
 @pytest.mark.long
 def test_the_free_weight_is_that_of_the_constant_filter_at_one_vertex() -> None:
     plant = _random_region(1)

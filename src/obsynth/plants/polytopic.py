@@ -21,7 +21,7 @@ from obsynth.errors import PreconditionError, SpecError, a_kind
 from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.convex_hulls import spanning_points
-from obsynth.numerics.expressions import parse_expression
+from obsynth.numerics.expressions import NAMED_NUMBERS, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of
@@ -248,7 +248,9 @@ def _from_vertices(
     """Return checked vertices, and their weights as scheduling parameters."""
     if isinstance(vertices, Sequence):
         vertices = [DescriptorSystem(**vertex) if isinstance(vertex, Mapping) else vertex for vertex in vertices]
-    if isinstance(vertices, DescriptorSystem) or not isinstance(vertices, Sequence) or not vertices:
+    if isinstance(vertices, Sequence) and not vertices:
+        raise SpecError("vertices are empty: give one DescriptorSystem or more.", path="vertices")
+    if isinstance(vertices, DescriptorSystem) or not isinstance(vertices, Sequence):
         raise SpecError(f"vertices are {a_kind(vertices)}: give a list of DescriptorSystem.", path="vertices")
     for place, vertex in enumerate(vertices):
         if not isinstance(vertex, DescriptorSystem):
@@ -338,6 +340,9 @@ def _from_expressions(
     functions = list(dict.fromkeys([*parameters, *used]))
     idle = [name for name in parameters if name not in _names_in(used)]
     if idle:
+        if idle[0] in NAMED_NUMBERS:
+            text = f"{idle[0]!r} is a number in expressions: give the parameter another name."
+            raise SpecError(text, path=f"scheduling.{idle[0]}")
         raise SpecError(
             f"No entry depends on {idle[0]!r}: leave it out of scheduling, or write it into an entry of the matrices.",
             path=f"scheduling.{idle[0]}",

@@ -175,9 +175,9 @@ class Scheduling:
         """Return the parameters in order; raise `SpecError` for a missing or an unknown one."""
         if isinstance(point, Mapping):
             if set(point) != set(self.names):
+                given = ", ".join(map(repr, point)) or "none"
                 raise SpecError(
-                    f"Scheduling parameters {', '.join(map(repr, point))} are given; give {', '.join(self.names)}.",
-                    path="scheduling",
+                    f"Scheduling parameters that are given: {given}; give {', '.join(self.names)}.", path="scheduling"
                 )
             point = [point[name] for name in self.names]
         try:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from obsynth.errors import counted
 from obsynth.methods.engines.vertex_certificates import NEGLIGIBLE, VertexCertificate
 from obsynth.plants.polytopic import PolytopicSystem
 
 
 def certificate_note(plant: PolytopicSystem, for_how_long: str) -> str:
     """Return for what the certificate is, and that nothing is claimed ``for_how_long`` after a row outside."""
+    corners = counted(plant.count, "vertex", "vertices")
     return (
-        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
+        f"One certificate at {corners}, for the region {plant.scheduling.sentence()}. A row with a "
         "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
         f"{for_how_long} from the last such row on."
     )

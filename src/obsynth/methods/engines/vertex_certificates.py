@@ -202,6 +202,8 @@ def certified_for_steps(
         slow = certified(errors, decay=common.decay, lyapunov="vertex", steps=steps, **options)
     except SolverError:
         return common
+    # What is least for every course bounds what is least for slow ones.
+    slow = replace(slow, is_negligible=slow.is_negligible or common.is_negligible)
     return slow if slow.level < common.level else common
 
 

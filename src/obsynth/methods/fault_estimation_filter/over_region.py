@@ -227,7 +227,8 @@ def _notes(
     decoupled: bool,
 ) -> tuple[str, ...]:
     notes = [certificate_note(plant, f"{rows_to_forget(certificate.decay)} rows")]
-    notes += unused_rate_notes(plant, steps if certificate.witness.G is not None else None)
+    if not decoupled:
+        notes += unused_rate_notes(plant, steps if certificate.witness.G is not None else None)
     if decoupled:
         notes.append(
             "No disturbance reaches a fault estimate, for every course of the parameters: the gain is zero but for "
