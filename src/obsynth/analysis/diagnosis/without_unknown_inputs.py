@@ -178,7 +178,7 @@ def _invariant(
         hidden, moving, staying = (turn(part)[:, rank:] for part in (hidden, moving, staying))
         still_leaving = turn(left_vectors[:, rank:].T @ leaving)[:, rank:]
         if count:
-            packed, factors, _, _ = dgeqrf(moving)
+            packed, factors, _, _ = dgeqrf(moving, lwork=LAPACK_BLOCK * count)
             moving, staying = (
                 np.triu(packed[:count]),
                 dormqr("L", "T", packed, factors, staying, LAPACK_BLOCK * count)[0],
