@@ -67,7 +67,7 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
     ("path", "value", "code", "words"),
     [
         ("plant/equations/valve", "outflow = c * sqrt(levle)", 2, ["equations.valve", "'levle'"]),
-        ("plant/equations/valve", None, 2, ["1 equations for 2 states", "too few"]),
+        ("plant/equations/valve", None, 2, ["1 equation for 2 states", "too few"]),
         ("plant/equations/valve", "inflow = 1", 2, ["'valve'", "neither a state"]),
         ("plant/equations/valve", "outflow = import os", 2, ["equations.valve", "'import os'", "invalid syntax"]),
         ("plant/equations/valve", 3.0, 2, ["equations", "a text"]),

@@ -29,7 +29,7 @@ def small(**changes) -> DAEModel:
     ("changes", "words"),
     [
         ({"equations": {"moves": "der(a) = -c * a + bb", "holds": "b = go"}}, ["equations.moves", "'bb'"]),
-        ({"equations": {"moves": "der(a) = -c * a + b"}}, ["1 equations for 2 states", "1 too few"]),
+        ({"equations": {"moves": "der(a) = -c * a + b"}}, ["1 equation for 2 states", "1 too few"]),
         ({"equations": {"moves": "der(a) = -c * a + b", "holds": "go = 1"}}, ["'holds'", "neither a state"]),
         ({"equations": {"moves": "der(a) = -c * a", "holds": "a = go"}}, ["state 'b' enters no equation"]),
         ({"equations": {"moves": "der(a) = -a + b", "holds": "b = go"}}, ["parameter 'c' enters no equation"]),
@@ -112,7 +112,7 @@ def test_an_if_on_a_state_is_refused_and_where_is_not() -> None:
         (lambda r, x, u, t: [r[0] - x[1]], ["IndexError", "rates, x, u, theta"]),
         (lambda r, x, u: [r[0] - x[0]], ["TypeError", "rates, x, u, theta"]),
         (lambda r, x, u, t: ["x"], ["cannot be called on symbols"]),
-        (lambda r, x, u, t: [r[0], x[0]], ["2 equations for 1 states", "1 too many"]),
+        (lambda r, x, u, t: [r[0], x[0]], ["2 equations for 1 state ", "1 too many"]),
         (lambda r, x, u, t: None, ["must return a list"]),
     ],
 )  # fmt: skip

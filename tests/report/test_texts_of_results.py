@@ -48,6 +48,15 @@ RESULTS: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
     "design": (design, ("Verified: all", "gamma = 1.538", "actuator 2")),
     "certificate": (lambda: design().certificate, ("gamma = 1.53795", "P_factor (4, 4)")),
     "observer": (lambda: design().observer, ("order 4", "2 inputs and 3 outputs")),
+    "estimates": (lambda: simulation().estimates, ("301 samples", "x4, actuator 1, actuator 2")),
+    "estimates of a sample": (
+        lambda: design().observer.step(design().observer.init(), [1.0, 0.0, 0.0], [0.0, 0.0])[1],
+        ("x1 = ", "actuator 2 = "),
+    ),
+    "recursive observer": (
+        lambda: obsynth.descriptor_kalman(SPEC.plant).observer,
+        ("RecursiveObserver", "nx="),
+    ),
     "simulation": (simulation, ("301 samples, 300 s", "actuator 1", "RMSE", "x4")),
     "evaluation": (
         lambda: obsynth.evaluate(design(), SPEC.scenario, runs=2, monitor=obsynth.monitor(design(), SPEC.scenario)),

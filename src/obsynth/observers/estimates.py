@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.signal_names import listed
 
 NO_NUMBERS = read_only(np.zeros(0))
 
@@ -122,6 +123,17 @@ class Estimates:
         for name, shape in unknown.items():
             if getattr(self, name) is NO_NUMBERS:
                 object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
+
+    def __repr__(self) -> str:
+        """Return names and values of one sample, names and the number of samples of a record."""
+        names = (*self.state_names, *self.fault_names)
+        if self.faults.size == len(self.fault_names) and self.states.size == len(self.state_names):
+            values = np.concatenate([self.states.ravel(), self.faults.ravel()])
+            return (
+                f"<Estimates: {listed([f'{name} = {value:.4g}' for name, value in zip(names, values, strict=True)])}>"
+            )
+        deviations = ", with deviations" if self.has_deviations else ""
+        return f"<Estimates of {self.faults.shape[-2]} samples: {listed(names) or 'nothing'}{deviations}>"
 
     @property
     def has_deviations(self) -> bool:

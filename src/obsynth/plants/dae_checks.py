@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.plants.checking import Problems
 from obsynth.plants.dae_equations import DAESymbols, symbols_of
@@ -41,7 +41,8 @@ def _square(model: DAEFields, symbols: DAESymbols) -> None:
     if rows != model.nx:
         few = "few" if rows < model.nx else "many"
         raise SpecError(
-            f"There are {rows} equations for {model.nx} states ({', '.join(model.state_names)}): "
+            f"There {'is' if rows == 1 else 'are'} {counted(rows, 'equation')} for {counted(model.nx, 'state')} "
+            f"({', '.join(model.state_names)}): "
             f"{abs(rows - model.nx)} too {few}.",
             path="equations",
         )

@@ -66,6 +66,8 @@ OTHER_NAMES = {
     **dict.fromkeys(("duration", "length", "end", "t_end", "tf", "stop_time", "until", "time"), "horizon"),
     **dict.fromkeys(("dt", "ts", "h", "step", "step_size"), "sample_time"),
     **dict.fromkeys(("x0", "initial", "start"), "initial_state"),
+    **dict.fromkeys(("parameters", "fault"), "faults"),
+    **dict.fromkeys(("unknown_inputs", "disturbance"), "disturbances"),
     **dict.fromkeys(("z0", "initial_observer_state"), "observer_state"),
 }
 

@@ -93,7 +93,8 @@ def reported(
         verdict=verdict,
         innovations=read_only(whitened),
         predictions=read_only(problem.y - result.innovations),
-        deviations=read_only(np.sqrt(result.variances)),
+        # Of a log without noise they are rounding, on either side of zero.
+        deviations=read_only(np.sqrt(np.maximum(result.variances, 0.0))),
         log=problem.log.described | {"digest": digest},
         units={name: problem.plant.units.get(name, "1") for name in names},
         output_names=problem.output_names,

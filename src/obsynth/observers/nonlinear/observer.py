@@ -143,6 +143,9 @@ class DAEObserver(DAESettings):
         Something is out of range or has the wrong shape.
     """
 
+    def __repr__(self) -> str:
+        return f"<DAEObserver of {self.model!r}>"
+
     @cached_property
     def steps(self) -> Steps:
         """What follows from the observer alone, made when it is first needed."""

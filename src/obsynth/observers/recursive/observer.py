@@ -69,6 +69,9 @@ class RecursiveObserver(RecursiveSettings):
     ('leak',)
     """
 
+    def __repr__(self) -> str:
+        return f"<RecursiveObserver of {self.plant!r}>"
+
     @cached_property
     def recursion(self) -> Recursion:
         """What follows from the observer alone, made when it is first needed."""
