@@ -109,7 +109,7 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
                              seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts,
                              repeats=np.full(len(design.plant.output_names), 3.0), ranges=ranges,
-                             memory=40.0 if estimates else 0.0)  # fmt: skip
+                             memory=40.0)  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

@@ -396,7 +396,7 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
 {
     int is_finite = 1;
     int i;
-    if (MONITOR_OWN == 0 || MONITOR_ESTIMATES == 0 || covariance == NULL || m->begun >= MONITOR_OWN_LATER) {
+    if (MONITOR_OWN == 0 || (MONITOR_ESTIMATES > 0 && covariance == NULL) || m->begun >= MONITOR_OWN_LATER) {
         return;
     }
     for (i = 0; i < CHANNELS; i++) {

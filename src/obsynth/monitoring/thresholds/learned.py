@@ -199,9 +199,9 @@ class LearnedThresholds:
 
     @property
     def takes_first_rows(self) -> bool:
-        """Whether the first rows of a run are taken for what is usual in its log, where they alarm: changes of faults
-        are watched, and the logs are too few to show which offsets others have."""
-        return bool(self.statistics.estimates) and self.logs < LOGS_FOR_OFFSETS
+        """Whether the first rows of a run are taken for what is usual in its log, where they alarm: the logs are too
+        few to show which offsets others have."""
+        return self.logs < LOGS_FOR_OFFSETS
 
     @property
     def statement(self) -> str:
@@ -245,10 +245,12 @@ class LearnedThresholds:
                 "this log, healthy rows may be in alarm; three normal logs that hold such drifts show it"
             )
         if self.memory:
+            slower = FAULTS_SLOWER * self.memory
+            changes = f", and changes of the faults over more than {slower:.6g}," if self.statistics.estimates else ""
             yield (
                 "one log does not distinguish slow faults from drifts: offsets of the residuals that come over more "
-                f"than about {self.memory:.6g} rows ({duration(self.memory * self.dt)}), and changes of the faults "
-                f"over more than {FAULTS_SLOWER * self.memory:.6g}, are followed and alarm nothing"
+                f"than about {self.memory:.6g} rows ({duration(self.memory * self.dt)}){changes} are followed and "
+                "alarm nothing"
             )
         if self.takes_first_rows:
             few = "one log does" if self.logs == 1 else f"{self.logs} logs do"

@@ -64,7 +64,7 @@ class LearnedState(NamedTuple):
     alarmed: int = 0  # whether the latest row that was decided passed a level
     raised: FloatArray = NOTHING  # ``(ages, nu)``: how far beyond their ranges the inputs of rows are, latest last
     begun: int = 0  # rows since the start that say what is usual in this log, up to the last of `OWN_ROWS`
-    own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults
+    own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults that walk
     ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
     decided: int = 0  # whether a row has been decided: the warm-up is over
     swings: Swings = Swings()  # of means of whitened rows, and of likelihood ratios, to both sides
@@ -135,9 +135,10 @@ class LearnedRule(Rule):
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
         effects = NO_EFFECTS if self.effects is None else self.effects.init()
         inputs = 0 if self._ranges is None else self._ranges.inputs
+        walking = 0 if self._walk is None else len(self._walk)
         state = LearnedState(
             np.tile(model.mean, (model.order, 1)), white, means, effects=effects, slow=np.zeros(model.channels),
-            raised=np.ones((max(AGES), inputs)), own=np.zeros(model.channels + len(self._names)),
+            raised=np.ones((max(AGES), inputs)), own=np.zeros(model.channels + walking),
             swings=Swings.none(self._swinging),
         )  # fmt: skip
         if self._walk is None:
@@ -286,11 +287,15 @@ class LearnedRule(Rule):
     def _own_of_start(self, state: LearnedState, observation: Any, *, counts: bool) -> LearnedState:
         """Return the state after a row that may be one of the first of a log: where an alarm stands once these are
         enough, they are what is usual in this log, and the rows before say nothing against that."""
-        taken = self._walk is not None and self.learned.takes_first_rows
-        if not (taken and counts and isinstance(observation, Evidence)) or state.begun >= OWN_ROWS[-1]:
+        if not (self.learned.takes_first_rows and counts) or state.begun >= OWN_ROWS[-1]:
             return state
         white = np.clip(np.nan_to_num(state.white[-1] + state.slow), -OWN_MOST, OWN_MOST)
-        own, begun = state.own + np.concatenate([white, observation.theta]), state.begun + 1
+        theta = NOTHING
+        if self._walk is not None:
+            if not isinstance(observation, Evidence):
+                return state
+            theta = observation.theta
+        own, begun = state.own + np.concatenate([white, theta]), state.begun + 1
         state = state._replace(own=own, begun=begun)
         if begun not in OWN_ROWS or not state.alarmed or not np.isfinite(own).all():
             return state

@@ -187,8 +187,8 @@ def learn_thresholds(
 
 def _memory(learned: LearnedThresholds, logs: NormalLogs) -> float:
     """Return over how many rows slow offsets of residuals are followed: where one log does not tell them from drifts,
-    and changes of faults are watched beside them."""
-    return FOLLOWED_ROWS if len(logs.ends) == 1 and learned.statistics.estimates else 0.0
+    and room for these is not given."""
+    return FOLLOWED_ROWS if len(logs.ends) == 1 and (learned.statistics.estimates or not learned.sensor_drift) else 0.0
 
 
 def _notes_of_output(
