@@ -504,7 +504,7 @@ def test_c_ends_an_alarm_that_stands_since_the_start_as_a_run_does(
     learned = replace(told(design), levels=0.02 * told(design).levels, logs=logs, memory=memory)
     monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
     run = obsynth.run_on_data(design, log, monitor=monitor)
-    assert any("taken for what is usual in this log" in text for text in run.warnings)
+    assert any("taken for what is usual in this log, and levels are raised" in text for text in run.warnings)
     (out,) = rows_in_c(design, monitor, [log], tmp_path)
     np.testing.assert_allclose(out[:, -2], run.table["statistic"], rtol=1e-9)
 

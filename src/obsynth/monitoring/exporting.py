@@ -14,7 +14,13 @@ from obsynth.monitoring.region_monitors import region_monitor_in_c
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, FOLLOWED_ROWS, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
-from obsynth.monitoring.thresholds.learned_rule import FOLLOWED_MOST, OWN_MOST, LearnedRule, follow_shares
+from obsynth.monitoring.thresholds.learned_rule import (
+    FOLLOWED_MOST,
+    OWN_MOST,
+    ROOM_OF_START,
+    LearnedRule,
+    follow_shares,
+)
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
@@ -96,7 +102,8 @@ class LearnedMonitorInC:
             f"    long equal[{max(self.outputs, 1)}];",
             f"    REAL raised[{max(AGES) * max(inputs, 1)}];",
             f"    REAL raised_now[{max(inputs, 1)}];",
-            "    int at, quiet, to_wait, alarmed, begun, ended;",
+            "    REAL roots, room;",
+            "    int at, quiet, to_wait, alarmed, begun, ended, stood;",
             "    long taken;",
             "    int decided;",
             f"}} {prefix}_monitor;",
@@ -165,6 +172,7 @@ class LearnedMonitorInC:
             "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
             "MONITOR_FOLLOW_LATER": later, "MONITOR_FOLLOW_LATER_IN_ALARM": later_in_alarm,
             "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
+            "MONITOR_ROOM": ROOM_OF_START,
             "MONITOR_SWING": SWING, "MONITOR_LEAST_SWINGS": LEAST_SWINGS, "MONITOR_SWING_ROOM": SWING_ROOM,
             "MONITOR_SWING_KEPT": 1.0 - 1.0 / SWING_MEMORY, "MONITOR_ROW_KEPT": 1.0 - 1.0 / ROW_MEMORY,
         }  # fmt: skip

@@ -352,8 +352,19 @@ class LogRun:
         return (
             f"An alarm stood when {self._watching.rule.ended} rows had been decided, and was ended there: the "
             f"thresholds are of {few} not distinguish an offset of this log from a fault that was there "
-            "from its first row on, so that these rows are taken for what is usual in this log. If the alarm was a "
-            "fault, it may still be there. Three normal logs tell (learn the thresholds from them).",
+            "from its first row on, so that these rows are taken for what is usual in this log"
+            f"{self._raised_by_start()}. If the alarm was a fault, it may still be there. Three normal logs tell "
+            "(learn the thresholds from them).",
+        )
+
+    def _raised_by_start(self) -> str:
+        """Return how far levels are raised by an alarm that stood since the start; nothing where they are not."""
+        room = self._watching.rule.room
+        if room <= 1.0:
+            return ""
+        return (
+            f", and levels are raised by what the alarm had reached (at the end of the run still {room:.2g} times the "
+            f"learned ones: changes that are found are {math.sqrt(room):.2g} times as large)"
         )
 
     def swinging(self) -> tuple[str, ...]:

@@ -42,7 +42,9 @@ static void monitor_reset(PREFIX_monitor *m)
         m->own[i] = 0;
     }
     monitor_calm(m);
-    m->begun = m->ended = 0;
+    m->begun = m->ended = m->stood = 0;
+    m->roots = 0;
+    m->room = 1;
     for (i = 0; i < MONITOR_OUTPUTS; i++) {
         m->repeated[i] = 0;
         m->equal[i] = 0;
@@ -105,7 +107,7 @@ static void monitor_raise(const PREFIX_monitor *m, REAL *levels)
         for (i = 0; i < MONITOR_INPUTS; i++) {
             root += (farthest[i] - 1) * monitor_rates[i][j];
         }
-        levels[j] = monitor_levels[0][j] * (root * root);
+        levels[j] = monitor_levels[0][j] * (root * root) * m->room;
     }
 }
 
@@ -391,8 +393,18 @@ static void monitor_centre(PREFIX_monitor *m, const REAL *theta, const REAL *cov
     }
 }
 
-/* Let the first rows of a log, once they are enough, be what is usual in it, where there is an alarm. */
-static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
+/* Let levels fall from where the start raised them, to what statistics still reach. */
+static void monitor_make_room(PREFIX_monitor *m, REAL reached)
+{
+    REAL room = m->room * MONITOR_SWING_KEPT;
+    reached = reached < m->room ? reached : m->room;
+    room = reached > room ? reached : room;
+    m->room = room > 1 ? room : 1;
+}
+
+/* Let the first rows of a log, once they are enough, be what is usual in it, where there is an alarm; statistics have
+ * `reached` so much in units of the levels that were learned. */
+static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covariance, REAL reached)
 {
     int is_finite = 1;
     int i;
@@ -409,6 +421,10 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
         m->own[CHANNELS + i] += theta[i];
     }
     m->begun++;
+    if (m->alarmed && isfinite(reached)) {
+        m->stood++;
+        m->roots += (REAL)sqrt(reached);
+    }
     for (i = 0; i < CHANNELS + MONITOR_ESTIMATES; i++) {
         is_finite = is_finite && isfinite(m->own[i]);
     }
@@ -429,6 +445,12 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
     }
     for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
         m->scores[i] = 0;
+    }
+    /* Where most of these rows were in alarm, levels rise by what it reached. */
+    if (2 * m->stood > m->begun) {
+        REAL root = m->roots / (REAL)m->stood;
+        REAL room = MONITOR_ROOM * root * root;
+        m->room = room > m->room ? room : m->room;
     }
     m->alarmed = 0;
     m->ended = 1;
@@ -599,8 +621,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
         m->alarmed = m->alarm;
+        statistic = m->statistic * m->room;
+        monitor_make_room(m, statistic);
         if (known) {
-            monitor_own(m, shown, covariance);
+            monitor_own(m, shown, covariance, statistic);
         }
     }
     if (m->alarm) {

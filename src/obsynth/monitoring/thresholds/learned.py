@@ -258,7 +258,8 @@ class LearnedThresholds:
             yield (
                 f"{few} not distinguish a fault that is there from the first row of a run on from an offset of that "
                 f"log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends there, as the "
-                f"means of these rows are taken for what is usual in this log{later}"
+                f"means of these rows are taken for what is usual in this log{later}, and levels rise by what the "
+                "alarm reached"
             )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)

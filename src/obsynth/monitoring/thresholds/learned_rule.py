@@ -22,7 +22,7 @@ from obsynth.monitoring.thresholds.parameter_scores import (
     parameter_walk,
     sample_score,
 )
-from obsynth.monitoring.thresholds.swings import Swings
+from obsynth.monitoring.thresholds.swings import SWING_MEMORY, Swings
 from obsynth.monitoring.thresholds.watched_columns import (
     has_innovations_by_sensor,
     innovation_names,
@@ -42,6 +42,11 @@ FOLLOWED_MOST = 3.0
 #: Deviations of a row that count in the means of a start, at most: one wrong sample moves them by a tenth, and an
 #: offset that is larger stays an alarm.
 OWN_MOST = 10.0
+
+#: Where most rows of a start that is taken for usual were in alarm, levels rise by so many times what statistics were
+#: there (the mean of their roots, so that wrong samples say little): what is off is known at the inputs of these rows
+#: alone, and does something else at others.
+ROOM_OF_START = 2.0
 
 #: While a level is passed the offset is followed so many times more slowly: what has come quickly stays an alarm.
 SLOWER_IN_ALARM = 10.0
@@ -67,6 +72,9 @@ class LearnedState(NamedTuple):
     own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults that walk
     ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
     decided: int = 0  # whether a row has been decided: the warm-up is over
+    stood: int = 0  # how many rows of the start were in alarm
+    roots: float = 0.0  # sum of the roots of their statistics
+    room: float = 1.0  # by which levels are raised, as an alarm of the start was ended
     swings: Swings = Swings()  # of means of whitened rows, and of likelihood ratios, to both sides
 
 
@@ -94,7 +102,7 @@ class LearnedRule(Rule):
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
     that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had,
-    and are followed from then on.
+    and are followed from then on; where most of these rows were in alarm, levels rise by what the alarm reached.
 
     Where means of whitened rows and likelihood ratios swing to both sides their levels rise by what they reach there:
     the noise has become slower than it was, as a fault would stay on one side."""
@@ -208,7 +216,10 @@ class LearnedRule(Rule):
             state, levels = self._swung(state, weights, sides * ratios, first[0], sample.time)
             values = values / levels
         values = np.where(np.isnan(values), np.inf, values)
-        state = self._own_of_start(state._replace(alarmed=int(values.max() > 1.0)), sample.observation, counts=counts)
+        largest = float(values.max())
+        reached = largest * state.room
+        state = self._roomy(state._replace(alarmed=int(largest > 1.0)), reached)
+        state = self._own_of_start(state, sample.observation, reached, counts=counts)
         # Faults are compared without what their slow offsets explain: each has its own.
         fault = (
             self._fault(values_of_row, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
@@ -245,7 +256,7 @@ class LearnedRule(Rule):
     ) -> tuple[LearnedState, FloatArray]:
         """Return the state after a row with signed likelihood ``ratios (k,)``, and levels, those of slow changes raised
         where they swing; ``weights``: of squared means, ``row``: the statistic of the row alone."""
-        levels = self.learned.levels * self._factors(state)
+        levels = self.learned.levels * self._factors(state) * state.room
         slow = slice(1, 1 + len(weights) + len(ratios))
         of_means, of_ratios = np.split(levels[slow], [len(weights)])
         means = (weights / of_means)[:, None] * state.means * np.abs(state.means)
@@ -284,7 +295,13 @@ class LearnedRule(Rule):
             moved = state.centres + share / FAULTS_SLOWER * away * deviations
         return state._replace(centres=np.where(np.isfinite(moved), moved, state.centres))
 
-    def _own_of_start(self, state: LearnedState, observation: Any, *, counts: bool) -> LearnedState:
+    @staticmethod
+    def _roomy(state: LearnedState, reached: float) -> LearnedState:
+        """Return the state whose levels fall from where the start raised them, to what statistics still ``reached``."""
+        kept = (1.0 - 1.0 / SWING_MEMORY) * state.room
+        return state._replace(room=max(kept, min(reached, state.room), 1.0))
+
+    def _own_of_start(self, state: LearnedState, observation: Any, reached: float, *, counts: bool) -> LearnedState:
         """Return the state after a row that may be one of the first of a log: where an alarm stands once these are
         enough, they are what is usual in this log, and the rows before say nothing against that."""
         if not (self.learned.takes_first_rows and counts) or state.begun >= OWN_ROWS[-1]:
@@ -297,12 +314,16 @@ class LearnedRule(Rule):
             theta = observation.theta
         own, begun = state.own + np.concatenate([white, theta]), state.begun + 1
         state = state._replace(own=own, begun=begun)
+        if state.alarmed and math.isfinite(reached):
+            state = state._replace(stood=state.stood + 1, roots=state.roots + math.sqrt(reached))
         if begun not in OWN_ROWS or not state.alarmed or not np.isfinite(own).all():
             return state
         slow, centres = np.split(own / begun, [len(white)])
+        room = ROOM_OF_START * (state.roots / state.stood) ** 2 if 2 * state.stood > begun else 1.0
         return state._replace(
-            slow=slow, centres=centres, white=np.zeros_like(state.white), means=np.zeros_like(state.means),
-            scores=np.zeros_like(state.scores), alarmed=0, ended=begun, swings=Swings.none(self._swinging),
+            slow=slow, centres=centres, room=max(state.room, room), white=np.zeros_like(state.white),
+            means=np.zeros_like(state.means), scores=np.zeros_like(state.scores), alarmed=0, ended=begun,
+            swings=Swings.none(self._swinging),
         )  # fmt: skip
 
     def _likelihood_ratios(self, state: LearnedState) -> tuple[FloatArray, FloatArray]:
