@@ -262,3 +262,26 @@ def test_a_plant_that_settles_over_thousands_of_samples_needs_no_scenario():
     (entry,) = compared.methods
     assert np.all(np.any(compared.truth == 1.0, axis=0))
     assert all(np.isfinite(fault.detection_delay) for fault in entry.faults)
+
+
+def test_deviations_for_noise_that_nobody_states_say_so() -> None:
+    parts = {"A": [[0.9, 0.1], [0.0, 0.8]], "C": np.eye(2), "Bf": [[1.0], [0.0]], "dt": 1.0}
+    assumed = "The plant states no noise: deviations are for white noise of deviation 1 on every output."
+    for noise in (None, {"y1": 0.1, "y2": 0.1}):
+        plant = obsynth.DescriptorSystem(**parts, sensor_noise=noise)
+        found = obsynth.compare(plant, methods=["functional-filter"], runs=2)
+        assert (assumed in found.meanings()) == (noise is None)
+
+
+def test_a_bound_that_is_rounding_is_shown_as_zero() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1.0], [0.0]], Bd=[[0.3], [1.0]], dt=1.0
+    )
+    scenario = obsynth.Scenario(
+        horizon=40, faults={"f1": obsynth.Step(size=1.0, start=10)}, disturbances={"d1": obsynth.Step(size=1.0)}
+    )
+    found = obsynth.compare(plant, scenario=scenario, methods=["ui-pi-observer"], runs=2)
+    (fault,) = found["ui-pi-observer"].faults
+    header, row = found.rows()
+    assert fault.bound < 1e-12
+    assert row[header.index("bound")] == "0"

@@ -74,7 +74,8 @@ class ComparisonSettings:
 
     def in_words(self, plant: DescriptorSystem, dt: float, horizon: float, limit: float, *, stabilised: bool) -> str:
         """Return the setting of a comparison as a sentence; ``horizon``, ``limit`` of the settling in seconds."""
-        parts = [f"{self.runs} runs of {duration(horizon)}, sampled every {dt:g} s, disturbances and noise drawn"]
+        runs = f"{self.runs} runs of {duration(horizon)}, sampled every {dt:g} s"
+        parts = [f"{runs}, disturbances and noise of the scenario"]
         parts += ["constants within their tolerances"] if plant.uncertainty is not None else []
         parts += [f"parameters off by up to {self.tolerance:.0%}"] if self.tolerance else []
         parts += ["a state feedback stabilises the plant"] if stabilised else []
@@ -504,7 +505,7 @@ def _reason(
             words[0] += f", against {short_delay(other_designs[0].equal_delay)} by {other_designs[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
-        words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")
+        words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.3g}")
     if not best.fast_enough:
         words.append("though none reaches 90 % of a step within the time asked for")
     slow = [entry.method for entry in other_designs if not entry.fast_enough] if best.fast_enough else []

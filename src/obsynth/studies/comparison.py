@@ -16,6 +16,8 @@ from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import is_noise_assumed
 from obsynth.report.plots.panels import data_url, with_unit, written
 from obsynth.results.certificate_files import result_text
 from obsynth.results.design import ObserverDesign
@@ -30,6 +32,9 @@ from obsynth.studies.ranking import comparison_statement
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+
+#: Noise counts as within so many deviations.
+DEVIATIONS = 3.0
 
 #: Samples of the window on which the least threshold is looked for, at most.
 LONGEST_WINDOW = 32
@@ -62,7 +67,7 @@ _HEADER = (
 )
 #: Where the bound stands among the numbers between order and time, and the shares of the least possible.
 _BOUND_COLUMN, _SHARE_COLUMNS = _HEADER.index("bound") - 3, slice(-2, None)
-#: A gain of at most this is zero but for rounding, and is shown as zero.
+#: A gain, or a bound as a share of the fault, of at most this is zero but for rounding, and is shown as zero.
 ROUNDED_GAIN = 1e-9
 
 #: What the columns of numbers mean.
@@ -77,12 +82,18 @@ _FIGURE_MEANINGS = {
     "bias": "largest mean of the estimate without a fault",
     "s to alarm": "median detection delay",
     "smallest": "step that half of the runs detect",
-    "bound": "largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances",
+    "bound": (
+        "largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances: those "
+        f"of the scenario, with noise within {DEVIATIONS:g} standard deviations"
+    ),
     "bound / optimum": (
         f"1 = as sensitive as the best test with the same delay on {LONGEST_WINDOW} samples of inputs and outputs (on "
         "fewer of plants with more than 78 states); below 1 = better, because the observer uses older samples"
     ),
-    "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
+    "rms": (
+        "root mean square of the estimate less the fault of the same sample in the runs, or on the log where it has a "
+        "column of the fault"
+    ),
     EQUAL_DELAY: (
         f"seconds from a fault to its alarm with the level that {100 * HEALTHY_TIME:g} % of the normal rows of the log "
         "pass; never: no more rows of the fault are in alarm than by chance"
@@ -170,7 +181,8 @@ class Comparison:
                 order, *figures, milliseconds = self._figures(entry, fault)
                 texts = [_number(value) for value in figures]
                 if np.isfinite(fault.bound):
-                    texts[_BOUND_COLUMN] = upper_number(fault.bound)
+                    is_rounding = fault.bound <= ROUNDED_GAIN * fault.size
+                    texts[_BOUND_COLUMN] = "0" if is_rounding else upper_number(fault.bound)
                 if k:
                     # What is of the method stands in its first row.
                     texts[_SHARE_COLUMNS] = ["", ""]
@@ -212,7 +224,20 @@ class Comparison:
         """
         columns_drawn = self._header if columns is None else columns
         texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns_drawn if name in _FIGURE_MEANINGS]
-        return " ".join(filter(None, ("; ".join(texts) + ".", _OF_THE_EXACT_MODEL, self._of_settled_gains)))
+        sentences = ("; ".join(texts) + ".", _OF_THE_EXACT_MODEL, self._of_assumed_noise, self._of_settled_gains)
+        return " ".join(filter(None, sentences))
+
+    @property
+    def _of_assumed_noise(self) -> str:
+        """Which noise deviations are for where the plant states none, in a sentence; empty where it does."""
+        plants = [entry.design.plant for entry in self.methods if entry.design is not None]
+        stated = (
+            isinstance(plant, DescriptorSystem) and plant.nw and not is_noise_assumed(plant.noise_names)
+            for plant in plants
+        )
+        if all(stated):
+            return ""
+        return "The plant states no noise: deviations are for white noise of deviation 1 on every output."
 
     @property
     def _of_settled_gains(self) -> str:

@@ -21,10 +21,7 @@ from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import upper_number
 from obsynth.simulation.scenario import Scenario
-from obsynth.studies.comparison import LONGEST_WINDOW
-
-#: Noise counts as within so many deviations.
-DEVIATIONS = 3.0
+from obsynth.studies.comparison import DEVIATIONS, LONGEST_WINDOW
 
 #: What a response may differ from one sample of the fault, and be taken as it.
 SAME_RESPONSE = 1e-6

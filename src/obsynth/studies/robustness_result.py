@@ -12,6 +12,7 @@ from obsynth.errors import SpecError, counted
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import freeze
+from obsynth.numerics.outward import lower_text
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.transformations.moving_disturbances import continuous_behind
 from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
@@ -206,8 +207,8 @@ class Robustness:
         if not math.isfinite(factor):
             return f"no limit up to {LARGEST_FACTOR:,.0f} times those stated"
         share = self.largest_tolerance
-        percent = "" if share is None else f" ({100.0 * share:.3g} %)"
-        return f"{factor:.4g} times those stated{percent}"
+        percent = "" if share is None else f" ({lower_text(100.0 * share, 3)} %)"
+        return f"{lower_text(factor)} times those stated{percent}"
 
     def _for_disturbances(self) -> str:
         """Return for which constants and disturbances the peak gains are."""

@@ -265,8 +265,10 @@ def sensor_sets(
     lost = [task for task in search.tasks(plant, chosen) if task not in reachable]
     if not reachable:
         raise PreconditionError(
-            f"Not even all {len(sensors)} candidates together suffice for any fault: to {goal} is not possible. Give "
-            "other candidates, or a weaker goal.",
+            f"Not even all {len(sensors)} candidates together suffice for any fault: to {goal} is not possible"
+            f"{' with unknown inputs that may do anything' if plant.nd else ''}. Give other candidates"
+            f"{'' if goal == 'detect' else ', or a weaker goal'}"
+            f"{', or bounds of the unknown inputs in a guaranteed-test (goal threshold)' if plant.nd else ''}.",
             condition="sensors",
             signals=tuple(plant.fault_names[i] for i in chosen),
         )

@@ -64,8 +64,10 @@ def evaluation_report(
     console: Console,
     units: Mapping[str, str],
     beside: Sequence[str] = (),
+    from_the_start: bool = False,
 ) -> None:
-    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
+    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds; ``from_the_start``: whether
+    errors are of all rows but the first, as those of recursive designs."""
     share = f"{100.0 * evaluation.confidence:g} % interval"
     console.print(Text(f"{name}: {evaluation.runs} runs", style="bold"))
     console.print()
@@ -88,11 +90,12 @@ def evaluation_report(
         console.print(Text(sentence))
     for title, errors in (("Fault estimates", evaluation.fault_rmse), ("State estimates", evaluation.state_rmse)):
         if errors:
-            table = headed_table("signal", "RMSE after warm-up", share, "unit")
+            since = "from row 1 on" if from_the_start else "after warm-up"
+            table = headed_table("signal", f"RMSE {since}", share, "unit")
             title, rows = worst_rows(title, list(errors.items()), lambda row: row[1].value)
             for signal, item in rows:
                 table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
-            print_section(console, f"{title} (mean over runs)", table)
+            print_section(console, f"{title} (mean over runs, against the signals of their time)", table)
 
 
 def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:

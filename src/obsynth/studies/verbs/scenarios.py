@@ -91,6 +91,7 @@ def _tolerance(text: str) -> float | str:
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
+    from obsynth.observers.linear.observer import LinearObserver
     from obsynth.studies.evaluate import evaluate
     from obsynth.studies.tables import evaluation_report
 
@@ -132,6 +133,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             console=stdout_console(),
             units=design.plant.units,
             beside=sentences,
+            from_the_start=not isinstance(design.observer, LinearObserver),
         ),
     )
     return 0

@@ -311,9 +311,15 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
 
 def _printed_cases(outcome: Any, width: int) -> Any:
     """Return the table of a sweep for people: without message and file."""
+    from obsynth.results.layout import bound_number
+
     header, rows = outcome.rows()
     columns = [i for i, name in enumerate(header) if name not in ("message", "file")]
-    texts = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in columns] for row in rows)
+    sides = {name: meaning.side for method in REGISTRY for name, meaning in method_class(method).claims.items()}
+    texts = (
+        [bound_number(row[i], sides.get(header[i], "")) if isinstance(row[i], float) else str(row[i]) for i in columns]
+        for row in rows
+    )
     return _printed(outcome, [header[i] for i in columns], texts, width)
 
 
