@@ -43,8 +43,8 @@ CASES = 64
 LIMIT = 300.0  # s
 ON_SAMPLES = ("fault-estimation-filter", "ui-pi-observer", "functional-filter", "optimal-filter", "guaranteed-test")
 IN_TIME = ("pd-observer", "ui-pi-observer", "functional-filter")
-#: What printed digits (three of sizes, rounded up where they are bounds; two of settling times) may hide.
-DIGITS, ROUNDED_UP, FEW_DIGITS = 5e-3, 1e-2, 5e-2
+#: What three printed digits may hide, to the nearest and rounded up, and what double precision may.
+DIGITS, ROUNDED_UP, ROUNDING = 5e-3, 1e-2, 1e-9
 #: Frequencies of sines, and parts of a sample in the programme.
 SINES, PARTS = 2_000, 8
 
@@ -121,7 +121,7 @@ def _five_deviations(sentences: Sentences, plant: WrittenPlant, design: ob.Obser
         once = [] if is_sampled else ["if the sensors are read once a second"]
         sentences.expect("five deviations", told, "if the model is exact", *once)
         own = 5.0 * _deviation(plant, design, is_sampled)
-        if abs(own - float(found.group(1))) > DIGITS * own:
+        if not own * (1.0 - ROUNDING) <= float(found.group(1)) <= own * (1.0 + ROUNDED_UP):
             sentences.refute("five deviations", f"{found.group(1)}, by a Lyapunov equation {own:.6g}")
 
 
@@ -237,7 +237,7 @@ def _settling(sentences: Sentences, plant: WrittenPlant, design: ob.ObserverDesi
     for told, found in sentences.paragraphs(rf"the slowest mode falls to 2 % in {NUMBER} s"):
         sentences.expect("slowest mode", told, "observer of order")
         stated = float(found.group(1)) / (design.linear[1].dt or 1.0)
-        if np.exp(slowest * stated * (1.0 + FEW_DIGITS)) > 0.02:
+        if np.exp(slowest * stated) > 0.02 * (1.0 + ROUNDING):
             sentences.refute("slowest mode", f"{found.group(1)}: {np.exp(slowest * stated):.3g} is left")
 
 

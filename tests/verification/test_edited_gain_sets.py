@@ -293,3 +293,35 @@ def places_of_arrays(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[An
     elif isinstance(tree, (dict, list)):
         for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
             yield from places_of_arrays(value, (*path, key))
+
+
+@pytest.fixture(scope="module")
+def sampled() -> dict[str, Any]:
+    plant = obsynth.discretise(CONTINUOUS, 0.1).plant
+    return json.loads(json.dumps(design_as_dict(obsynth.fault_estimation_filter(plant))))
+
+
+@pytest.mark.parametrize(
+    ("name", "edit"),
+    [("rows", -1), ("rows", 1.5), ("rows", 99), ("rows", True), ("columns", -1), ("size", -2), ("size", 2.5)],
+)
+def test_entries_of_the_plant_as_written_have_one_place(sampled: dict[str, Any], name: str, edit: Any) -> None:
+    """An index of -1 was that of the last row, 1.5 that of row 1; whoever else reads the file may take another."""
+    document = copy.deepcopy(sampled)
+    assert obsynth.verify(loaded(json.dumps(document).encode())).passed
+    holder = document["design"]["source"]["matrices"]["A"][name]
+    holder[-1] = edit
+    document["sha256"] = digest_of(document["design"])
+    with pytest.raises(obsynth.SpecError):
+        loaded(json.dumps(document).encode())
+
+
+def test_no_entry_of_the_plant_as_written_is_stored_twice(sampled: dict[str, Any]) -> None:
+    """The last one counted, so that another value stood before it."""
+    document = copy.deepcopy(sampled)
+    entries = document["design"]["source"]["matrices"]["A"]
+    for name, value in (("rows", entries["rows"][0]), ("columns", entries["columns"][0]), ("values", 7.0)):
+        entries[name].insert(0, value)
+    document["sha256"] = digest_of(document["design"])
+    with pytest.raises(obsynth.SpecError, match="stored twice"):
+        loaded(json.dumps(document).encode())

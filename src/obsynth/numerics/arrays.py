@@ -185,6 +185,29 @@ def as_matrix(value: Any, name: str) -> FloatArray:
     return read_only(matrix)
 
 
+def whole_numbers(values: Any, name: str, *, below: float = math.inf) -> NDArray[np.int64]:
+    """Return stored counts, or positions below a limit; raise `SpecError` for negative numbers and fractions, which
+    another reader might take in another way."""
+    stored = np.asarray(values)
+    truths = isinstance(values, list) and any(isinstance(entry, bool) for entry in values)
+    if stored.size and (
+        stored.ndim != 1
+        or stored.dtype.kind not in "iuf"
+        or truths
+        or not ((stored >= 0) & (stored < below) & (stored % 1 == 0)).all()
+    ):
+        raise SpecError(f"{name}: whole numbers from 0 on{'' if below == math.inf else f', below {below}'}.", path=name)
+    return stored.ravel().astype(np.int64)
+
+
+def require_entries_once(rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray, width: int) -> None:
+    """Raise `SpecError` unless entries of a stored matrix have one value each, and none is stored twice."""
+    if not rows.shape == columns.shape == values.shape:
+        raise SpecError("Entries of a matrix: as many rows and columns as values.", path="values")
+    if len(np.unique(rows * width + columns)) < len(rows):
+        raise SpecError("Entries of a matrix: one is stored twice.", path="rows")
+
+
 def real_entries(raw: NDArray[Any]) -> NDArray[Any]:
     """Return an array of fractions, decimals or numbers of sympy in double precision, and one of complex numbers
     without imaginary parts as its real part; any other as it is."""

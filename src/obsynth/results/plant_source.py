@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, require_entries_once, whole_numbers
 from obsynth.plants.descriptor import MOST_STORED_STATES, DescriptorSystem
 from obsynth.plants.transformations.delays import absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
@@ -63,8 +63,15 @@ def _entries(matrix: FloatArray) -> dict[str, Any]:
 
 
 def _matrix(entries: Mapping[str, Any]) -> FloatArray:
-    matrix = np.zeros([int(size) for size in entries["size"]])
-    matrix[np.array(entries["rows"], dtype=np.int64), np.array(entries["columns"], dtype=np.int64)] = entries["values"]
+    rows, columns = whole_numbers(entries["size"], "size").tolist()
+    places = (
+        whole_numbers(entries["rows"], "rows", below=rows),
+        whole_numbers(entries["columns"], "columns", below=columns),
+    )
+    values = np.asarray(entries["values"], dtype=np.float64)
+    require_entries_once(*places, values, columns)
+    matrix = np.zeros((rows, columns))
+    matrix[places] = values
     return matrix
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, require_entries_once, whole_numbers
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import csr
 from obsynth.numerics.sparse_factor import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, sparse_factor
@@ -95,9 +96,14 @@ class RecoveryOperator:
         """Return what `as_dict` wrote."""
 
         def matrix(entry: Mapping[str, Any]) -> Any:
-            indices, starts = (np.asarray(entry[name]).astype(np.int64) for name in ("indices", "starts"))
-            shape = int(entry["rows"]), int(entry["columns"])
-            return scipy.sparse.csr_array((np.asarray(entry["values"]), indices, starts), shape=shape)
+            rows, columns = whole_numbers([entry["rows"], entry["columns"]], "rows and columns").tolist()
+            values = np.asarray(entry["values"], dtype=np.float64)
+            indices = whole_numbers(entry["indices"], "indices", below=columns)
+            starts = whole_numbers(entry["starts"], "starts", below=len(values) + 1)
+            if len(starts) != rows + 1 or starts[0] or (np.diff(starts) < 0).any():
+                raise SpecError("starts: one for each row and the end, none before the last one.", path="starts")
+            require_entries_once(np.repeat(np.arange(rows), np.diff(starts)), indices, values, columns)
+            return scipy.sparse.csr_array((values, indices, starts), shape=(rows, columns))
 
         parts = {name: matrix(data[name]) for name in ("dynamic", "algebraic", "coupling", "right")}
         noise = None if data["noise"] is None else np.asarray(data["noise"])
