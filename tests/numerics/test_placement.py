@@ -14,6 +14,7 @@ from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, c
 from obsynth.methods.engines.region import region_gain
 from obsynth.numerics.eigenstructure import jordan_form, place
 from obsynth.numerics.observable_part import observable_split
+from obsynth.numerics.placed_noise import PlacedNoise
 from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import decay_rates, spectrum_error
 
@@ -268,3 +269,34 @@ class TestDesigns:
         assert verify(again).passed
         np.testing.assert_array_equal(again.observer.Az, design.observer.Az)
         assert again.options["fault_model_in_words"] == {"leak": "sinusoid of 2 rad/s"}
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_what_poles_leave_free_is_spent_on_noise(dt: float) -> None:
+    """The same poles, and less of the noise in the estimate, which is summed sample by sample."""
+    rng = np.random.default_rng(3)
+    f = rng.standard_normal((5, 5)) - 2.0 * np.eye(5)
+    f = scipy.linalg.expm(dt * f) if dt else f
+    c, b, read = rng.standard_normal((3, 5)), np.zeros((5, 3)), rng.standard_normal((1, 5))
+    d = np.diag([0.01, 0.1, 1.0])
+    rates = np.linspace(3.0, 5.0, 5)
+    poles = np.exp(-rates * dt) if dt else -rates
+    noise = PlacedNoise(f, c, b, d, read, dt)
+
+    def summed(gain: np.ndarray) -> float:
+        step = dt or 1e-3
+        ahead = f - gain @ c if dt else scipy.linalg.expm(step * (f - gain @ c))
+        driven, total = gain @ d, 0.0
+        for _ in range(int(20.0 / step)):
+            total += float(np.sum((read @ driven) ** 2)) * (1.0 if dt else step)
+            driven = ahead @ driven
+        return total
+
+    (plain, _), (quiet, _) = place(f, c, poles, dt=dt), place(f, c, poles, dt=dt, noise=noise)
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(f - quiet @ c).real), np.sort(poles), rtol=1e-6)
+    assert summed(quiet) < 0.9 * summed(plain)
+    assert noise.value_and_slope(quiet)[0] == pytest.approx(summed(quiet), rel=1e-2)
+    direction = rng.standard_normal(quiet.shape)
+    after, before = (noise.value_and_slope(quiet + change * direction)[0] for change in (1e-6, -1e-6))
+    slope = noise.value_and_slope(quiet)[1]
+    assert np.sum(slope * direction) == pytest.approx((after - before) / 2e-6, rel=1e-5)

@@ -16,6 +16,7 @@ import numpy as np
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.placed_noise import PlacedNoise
 from obsynth.numerics.spectra import SAME_POLE, decay_rates, pole_text, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
@@ -27,6 +28,9 @@ MOST_PLACEMENT_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
 
 #: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
 FIRST_SEARCH_STEPS, FINALISTS = 40, 3
+
+#: Steps of the search for less noise, and how much a condition that is e times as large counts, in its logarithm.
+QUIETENING_STEPS, CONDITION_SHARE = 200, 0.05
 
 #: Seed of the starts: the same question gives the same gains.
 STARTS_SEED = 20240
@@ -77,9 +81,13 @@ def place(
     dt: float = 0.0,
     objective: str = "conditioning",
     weight: FloatArray | None = None,
+    noise: PlacedNoise | None = None,
 ) -> tuple[FloatArray, float]:
     """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of the (generalised) eigenvectors;
-    ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``."""
+    ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``.
+
+    ``noise``: of these gains one near the best of the objective is taken that makes less of it.
+    """
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
         return np.zeros((0, outputs)), 1.0
@@ -111,6 +119,10 @@ def place(
             best = candidate
     if best is None:
         raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
+    if noise is not None and (quieter := problem.quieter(best[1], noise)) is not None:
+        x, gain = problem.solution(quieter)
+        if spectrum_error(f - (first + gain.T) @ c, poles, dt) <= PLACEMENT_TOLERANCE:
+            return first + gain.T, float(np.linalg.cond(x))
     x, gain = problem.solution(best[1])
     k = first + gain.T
     error = spectrum_error(f - k @ c, poles, dt)
@@ -181,33 +193,48 @@ class _Sylvester:
             weight = -2.0 * gain.T @ weighted @ inverse.T
             direct = 2.0 * weighted @ inverse.T
         else:
-            own, other = float(np.sum(x**2)), float(np.sum(inverse**2))
-            value = own * other
-            weight = 2.0 * other * x - 2.0 * own * inverse.T @ inverse @ inverse.T
+            value, weight = _conditioning(x, inverse)
             direct = np.zeros_like(g)
         gradient = direct + self.B.T @ self.adjoint(weight)
         return float(np.log(value)), np.asarray(gradient / value).ravel()
+
+    def quieter(self, start: FloatArray, noise: PlacedNoise) -> FloatArray | None:
+        """Return a G near ``start`` whose gain makes less of the noise; ``None`` where none is found."""
+
+        def evaluate(flat: FloatArray) -> tuple[float, FloatArray]:
+            g = flat.reshape(start.shape)
+            x = self.states(g)
+            inverse = np.linalg.inv(x)
+            gain = g @ inverse
+            value, slope = noise.value_and_slope((gain + self.shift).T)
+            condition, of_condition = _conditioning(x, inverse)
+            if not (value > 0.0 and np.isfinite(value)):
+                return np.inf, np.zeros(g.size)
+            weight = -gain.T @ slope.T @ inverse.T / value + CONDITION_SHARE * of_condition / condition
+            gradient = slope.T @ inverse.T / value + self.B.T @ self.adjoint(weight)
+            return float(np.log(value) + CONDITION_SHARE * np.log(condition)), np.asarray(gradient).ravel()
+
+        g = self.normalised(start)
+        try:
+            before, after = evaluate(g.ravel())[0], _minimised(evaluate, g, QUIETENING_STEPS)
+        except np.linalg.LinAlgError:
+            return None
+        return after[1] if after[0] < before else None
 
     def minimised(
         self, start: FloatArray, *, steps: int = MOST_PLACEMENT_STEPS, restarts: int = RESTARTS
     ) -> tuple[float, FloatArray] | None:
         """Return the least value found and its G; ``None`` when the equation is singular from the start."""
-        from scipy.optimize import minimize
-
-        evaluate: Callable[[FloatArray], Any] = self.value_and_gradient
         best: tuple[float, FloatArray] | None = None
         g = start
         try:
             for _ in range(restarts):
-                g = self.normalised(g)
-                with np.errstate(all="ignore"):
-                    done = minimize(evaluate, g.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": steps})
-                if not np.isfinite(done.fun):
+                value, g = _minimised(self.value_and_gradient, self.normalised(g), steps)
+                if not np.isfinite(value):
                     break
-                gained = np.inf if best is None else best[0] - float(done.fun)
-                g = np.asarray(done.x).reshape(start.shape)
+                gained = np.inf if best is None else best[0] - value
                 if best is None or gained > 0.0:
-                    best = (float(done.fun), g)
+                    best = (value, g)
                 if gained < LEAST_PROGRESS:
                     break
         except np.linalg.LinAlgError:
@@ -222,6 +249,21 @@ class _Sylvester:
             linked = (linked.astype(float) @ linked.astype(float)) > 0.0
         chains = np.array([np.max(lengths[row]) for row in linked])
         return np.asarray(g / np.where(chains > 0.0, chains, 1.0))
+
+
+def _minimised(evaluate: Callable[[FloatArray], Any], start: FloatArray, steps: int) -> tuple[float, FloatArray]:
+    """Return the least value that L-BFGS finds, and where."""
+    from scipy.optimize import minimize
+
+    with np.errstate(all="ignore"):
+        done = minimize(evaluate, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": steps})
+    return float(done.fun), np.asarray(done.x).reshape(start.shape)
+
+
+def _conditioning(x: FloatArray, inverse: FloatArray) -> tuple[float, FloatArray]:
+    """Return the square of the condition in the Frobenius norm, and its slope in X."""
+    own, other = float(np.sum(x**2)), float(np.sum(inverse**2))
+    return own * other, np.asarray(2.0 * other * x - 2.0 * own * inverse.T @ inverse @ inverse.T)
 
 
 def checked_poles(

@@ -71,7 +71,8 @@ class UiPiObserver(Method):
         dimensionless).
     objective : {"conditioning", "gain"} or callable, optional
         What to make of the freedom that ``poles`` leaves; or a function of the variables of the inequality that
-        returns what is minimised.
+        returns what is minimised.  With ``conditioning``, where the plant states noise of its sensors, gains near the
+        best conditioned ones with less noise in the fault estimates are taken.
     joint : bool, optional
         Design K and the free part of the decoupling (the paper's G) together; the fault estimates may then see the
         outputs directly.

@@ -29,6 +29,7 @@ from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, k
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.invariant_zeros import is_outside
+from obsynth.numerics.placed_noise import PlacedNoise
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import decay_rates, eigenvalues
@@ -216,7 +217,7 @@ def _with_quietest_outputs(
 ) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
     """Return which outputs to take for given poles, with the problem and its gain: of all choices, the least noisy.
 
-    Placement sees no noise: of the gains with these poles it takes well-conditioned ones, whatever a sensor adds."""
+    Gains with these poles are searched from well-conditioned ones, which no noise chose, whatever a sensor adds."""
 
     def designed(some: MergedOutputs) -> tuple[MergedOutputs, _Compared]:
         alone = existence(some.plant, model)
@@ -272,12 +273,20 @@ def _problem_and_choice(
     return problem, _chosen(method, problem, None, weights, known.plant.dt)
 
 
-def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str) -> Choice:
-    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
+def _placed(
+    problem: PlacementProblem, poles: Sequence[complex], objective: str, noise: KalmanProblem | None = None
+) -> Choice:
+    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed.
+
+    ``noise``: what these leave free is spent on."""
     split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.undisturbed, np.eye(plant.ny))
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
     scaled_poles = [units.rate * pole for pole in poles]
+    placed_noise = None
+    if noise is not None:
+        of_outputs = noise.D / outputs[:, None]
+        placed_noise = PlacedNoise(split.F, split.C / outputs[:, None], noise.B, of_outputs, noise.estimates, plant.dt)
     gain, condition = place(
         split.F,
         split.C / outputs[:, None],
@@ -285,6 +294,7 @@ def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str)
         dt=plant.dt,
         objective=objective,
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
+        noise=placed_noise,
     )
     return gain / outputs, poles, {"condition": condition}, ()
 
@@ -296,7 +306,8 @@ def _chosen(
     split, time = problem.split, problem.units.time
     if method.poles is not None:
         poles = checked_poles(method.poles, split.order, problem.fixed_modes, dt)
-        return _placed(problem, poles, method.objective)
+        spends = method.leaves_freedom_to_us and not method.joint and problem.plant.Dw.any()
+        return _placed(problem, poles, method.objective, kalman_problem(problem, weights) if spends else None)
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
