@@ -184,7 +184,7 @@ class _Sylvester:
     def value_and_gradient(self, flat: FloatArray) -> tuple[float, FloatArray]:
         g = flat.reshape(self.B.shape[1], -1)
         x = self.states(g)
-        inverse = np.linalg.inv(x)
+        inverse = np.asarray(np.linalg.inv(x), dtype=np.float64)
         if self.objective == "gain":
             gain = g @ inverse
             total = gain + self.shift
@@ -204,7 +204,7 @@ class _Sylvester:
         def evaluate(flat: FloatArray) -> tuple[float, FloatArray]:
             g = flat.reshape(start.shape)
             x = self.states(g)
-            inverse = np.linalg.inv(x)
+            inverse = np.asarray(np.linalg.inv(x), dtype=np.float64)
             gain = g @ inverse
             value, slope = noise.value_and_slope((gain + self.shift).T)
             condition, of_condition = _conditioning(x, inverse)
