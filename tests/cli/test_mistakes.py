@@ -231,7 +231,7 @@ def test_what_there_is_stands_in_the_message_where_nothing_is_close() -> None:
     given = {"A": [[0.5]], "C": [[1.0]], "dt": 1.0}
     with pytest.raises(obsynth.SpecError, match=r"no signal named 'z'\. There are: y1\."):
         obsynth.DescriptorSystem(**given, sensor_noise={"z": 0.1})
-    with pytest.raises(obsynth.SpecError, match=r"Bf=\[\[1\]\] for a column or Bf=\[\[1\]\] for a row"):
+    with pytest.raises(obsynth.SpecError, match=r"Bf=\[\[1\]\] for a column or Bf=\[\[1\]\] for a row\."):
         obsynth.DescriptorSystem(**given, Bf=[1])
     with pytest.raises(obsynth.SpecError, match=r"fault_names has 2 names, but the plant has 1 fault \(column of Bf"):
         obsynth.DescriptorSystem(**given, Bf=[[1]], fault_names=["a", "b"])
@@ -342,3 +342,9 @@ def test_a_file_that_is_no_gain_set_says_how_one_is_written(tmp_path: Path) -> N
     (tmp_path / "gains.json").write_text("[]", encoding="utf-8")
     with pytest.raises(obsynth.SpecError, match=r"is no gain set.*obsynth design --system SPEC --output FILE"):
         obsynth.load(tmp_path / "gains.json")
+
+
+def test_variances_in_a_list_are_answered_with_a_diagonal() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5, 0], [0, 0.4]], C=[[1, 0], [0, 1]], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match=r"or Q=numpy\.diag\(\[1, 2\]\) for a diagonal"):
+        obsynth.descriptor_kalman(plant, Q=[1, 2])

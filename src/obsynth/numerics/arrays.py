@@ -228,12 +228,14 @@ def _is_no_real_number(entry: Any) -> bool:
 
 
 def _as_rows(vector: NDArray[Any], name: str) -> str:
-    """Return how an array that is no matrix is written as one: a short vector as a column and as a row."""
+    """Return how an array that is no matrix is written as one: a short vector as a column, a row or a diagonal."""
     if vector.ndim != 1 or not 0 < vector.size <= LONGEST_EXAMPLE:
         return "give a matrix (a list of rows)"
     entries = [str(entry) for entry in vector.tolist()]
     column = ", ".join(f"[{entry}]" for entry in entries)
-    return f"give a list of rows, {name}=[{column}] for a column or {name}=[[{', '.join(entries)}]] for a row"
+    listed = ", ".join(entries)
+    diagonal = f", or {name}=numpy.diag([{listed}]) for a diagonal" if vector.size > 1 else ""
+    return f"give a list of rows, {name}=[{column}] for a column or {name}=[[{listed}]] for a row{diagonal}"
 
 
 def reachable(matrix: FloatArray) -> NDArray[np.bool_]:
