@@ -53,7 +53,22 @@ def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys
     assert evaluated(gains, "--runs", "3") == 0
     printed = capsys.readouterr().out
     assert "false alarms" not in printed
-    assert "RMSE" in printed
+    assert "RMSE after warm-up" in printed
+
+
+def test_errors_of_a_recursive_design_are_from_the_start(tmp_path, capsys):
+    """It states how uncertain it is from the first row on: no warm-up is left out, and the table says none is."""
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(
+        "schema_version: 1\nname: lag\n"
+        "plant: {dt: 1.0, A: [[0.9]], C: [[1.0]], sensor_noise: {y1: 0.1}}\n"
+        "method: {id: descriptor-kalman, options: {Q: 0.01}}\n"
+        "scenario: {horizon: 20, noise: 1}\n"
+    )
+    assert main(["evaluate", "--system", str(spec), "--runs", "2", "--quiet"]) == 0
+    printed = capsys.readouterr().out
+    assert "RMSE from row 1 on" in printed
+    assert "warm-up" not in printed
 
 
 @pytest.mark.long

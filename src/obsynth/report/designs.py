@@ -195,7 +195,7 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
         yield name.replace("_", " "), f"{bound_number(value, side)} {unit}".strip(), meaning
     for check in design.report.checks:
         if check.name == "H-infinity norm":
-            yield "norm", number(check.value), "the same gain recomputed by a second route"
+            yield "norm", number(check.value), "that gain itself, which gamma bounds, computed by a second route"
     yield "observer order", str(design.observer.order), "states of the shipped realisation"
 
 
