@@ -84,3 +84,29 @@ def test_faults_that_the_sensors_cancel_have_settled() -> None:
     settled = steady(plant, np.ones(3), np.zeros(3))
     assert settled.steps < 5000
     np.testing.assert_allclose(settled.observer.Dy[:3] @ plant.C, np.eye(3), atol=1e-6)
+
+
+@pytest.mark.parametrize("faults", [False, True])
+def test_gains_of_which_a_rest_decays_over_millions_of_steps_settle(faults: bool) -> None:
+    # A rest of 1e-8 was left to the recursion, which took all of its steps and said that there is no limit.
+    q, r = 3e-10, 1.0
+    plant = obsynth.DescriptorSystem(A=[[1.0]], C=[[1.0]], Bf=np.full((1, int(faults)), 1.0), dt=1.0)
+    found = steady(plant, np.array([q]), np.array([r]))
+    predicted = 0.5 * (q + np.sqrt(q * q + 4.0 * q * r))
+    gain = predicted / (predicted + r)
+    assert 1.0 - gain > 0.99998
+    assert found.steps < 3_000
+    np.testing.assert_allclose(found.observer.Az[0, 0], 1.0 - gain, rtol=0.0, atol=1e-12)
+
+
+def test_gains_that_fall_asleep_are_refused_before_they_are_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A constant that nothing disturbs, beside a state that noise moves.
+    plant = obsynth.DescriptorSystem(A=np.diag([1.0, 0.5]), C=np.eye(2), dt=1.0)
+    asleep = recursive(plant, np.array([0.0, 1.0]), np.ones(2))
+    known = obsynth.descriptor_kalman(plant, Q=np.diag([0.0, 1.0]), R=np.eye(2), initial_covariance=np.diag([0.0, 1.0]))
+    monkeypatch.setattr("obsynth.observers.recursive.steady_observer.gain_steps", lambda *_, **__: pytest.fail("taken"))
+    with pytest.raises(obsynth.PreconditionError, match="z = 1 the noise does not act"):
+        steady_observer(asleep)
+    # What is known exactly at first is not learnt, and its gains have a limit.
+    with pytest.raises(pytest.fail.Exception, match="taken"):
+        steady_observer(known.recursive[1])

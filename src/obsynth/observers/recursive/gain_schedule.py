@@ -18,6 +18,9 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.recursion import posterior_residual
 from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, rounding_of, spreads
 
+#: Steps of the recursion before it is held to settle nowhere.
+MOST_SETTLING_STEPS = 20_000
+
 #: Numbers of gains that are kept for a second look, of twenty megabytes.
 MOST_KEPT_GAINS = 2**21
 

@@ -28,8 +28,8 @@ from obsynth.numerics.ranks import (
     product_but_rounding,
 )
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
+from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.steady_observer import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.step_model import StepMatrices, rounding_of, stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -187,12 +187,17 @@ def settled_contraction(observer: RecursiveObserver) -> float | None:
     return float(np.sqrt(steady.rate))
 
 
+def is_uncertain_at_first(observer: RecursiveObserver) -> bool:
+    """Whether the stated covariance of the first state leaves no direction of it known exactly."""
+    start = np.asarray(observer.initial_covariance)
+    deviations = np.sqrt(np.maximum(np.diag(start), np.finfo(np.float64).tiny))
+    return decide_rank(start / np.outer(deviations, deviations)).full
+
+
 def forgets_its_start(observer: RecursiveObserver) -> bool:
     """Whether gains tend to those of the steady state from the stated covariance of the first state: it is uncertain in
     all states, or noise, which is constant, reaches every mode that does not decay."""
-    start = np.asarray(observer.initial_covariance)
-    deviations = np.sqrt(np.maximum(np.diag(start), np.finfo(np.float64).tiny))
-    if decide_rank(start / np.outer(deviations, deviations)).full:
+    if is_uncertain_at_first(observer):
         return True
     q, r = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
     return not _unreached(observer.plant, q, r)
@@ -201,7 +206,10 @@ def forgets_its_start(observer: RecursiveObserver) -> bool:
 def _unreached(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> list[complex]:
     """Return the modes that do not decay and that no noise reaches."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
-    noise = stacked_noise(Q_root, R_root)
+    if decide_rank(R_root, expected=len(R_root)).full:
+        # Noise of its own in every output: equations alone lose rank, or nothing does.
+        C, R_root = C[:0], R_root[:0]
+    noise = stacked_noise(Q_root[:, Q_root.any(axis=0)], R_root[:, R_root.any(axis=0)])
     wide_e = np.hstack([np.vstack([E, C]), np.zeros_like(noise)])
     wide_a = np.hstack([np.vstack([A, np.zeros_like(C)]), noise])
     zeros = finite_zeros(wide_e, wide_a, to_the_end=False)

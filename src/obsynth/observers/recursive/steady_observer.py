@@ -8,11 +8,12 @@ import numpy as np
 
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.ranks import product_but_rounding
+from obsynth.numerics.ranks import covariance_factor, product_but_rounding
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS, GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_filter import is_uncertain_at_first, reached_condition
 from obsynth.observers.sensor_timing import require_plain
 
 #: The gains have settled when what is left of their way is below this share of them.
@@ -20,9 +21,6 @@ SETTLED_GAINS = 1e-13
 
 #: Gains that move by less than these roundings do not move.
 UNMOVED_GAINS = 4.0 * np.finfo(np.float64).eps
-
-#: Steps of the recursion before it is held to settle nowhere.
-MOST_SETTLING_STEPS = 20_000
 
 #: Steps in a row that must have settled: at a turning point gains stand still, too.
 STILL_STEPS = 5
@@ -69,6 +67,7 @@ def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
             "use the recursion itself (obsynth run), or design without reset.",
             path="reset",
         )
+    _require_noise_that_reaches(observer)
     settled, steps = _settled(observer)
     realisation, start = _realised(observer, settled)
     radius = abscissa(realisation.Az, observer.dt)
@@ -79,6 +78,21 @@ def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
             condition="stable steady filter",
         )
     return SteadyObserver(realisation, read_only(start), steps)
+
+
+def _require_noise_that_reaches(observer: RecursiveObserver) -> None:
+    """Raise `PreconditionError` where gains fall asleep like ``1 / k``, without following thousands of them: a mode on
+    the unit circle that no noise reaches, and that is uncertain at first, as a start that is known leaves it alone."""
+    walks = observer.adaptation is not None and observer.adaptation.form == "random-walk"
+    if walks or observer.early_constraints or not is_uncertain_at_first(observer):
+        return
+    roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+    reached = reached_condition(observer.plant, *roots)
+    if not reached.holds:
+        raise PreconditionError(
+            f"The gains do not settle: {reached.detail} Or run the recursion itself (obsynth run).",
+            condition=reached.name,
+        )
 
 
 def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
@@ -121,7 +135,8 @@ def _leap(k: int, gains: GainStep) -> tuple[FloatArray, FloatArray] | None:
     if len(step.H) != gains.gain.shape[1]:
         return None
     transition, factor = gains.gain[:, :ne] @ step.A, product_but_rounding(gains.gain, step.noise)
-    if not abscissa(transition, 1.0) < 1.0:
+    radius = abscissa(transition, 1.0)
+    if not radius < 1.0:
         return None
     Upsilon = gains.Upsilon
     if Upsilon.shape[1]:
@@ -132,7 +147,9 @@ def _leap(k: int, gains: GainStep) -> tuple[FloatArray, FloatArray] | None:
         if np.all(np.linalg.norm(further, axis=1) <= np.finfo(np.float64).eps * np.linalg.norm(factor, axis=1)):
             covariance = factor @ factor.T
             short = _distance(covariance, gains.factor @ gains.factor.T) + _distance(Upsilon, gains.Upsilon)
-            return None if short <= ROUNDED_GAINS else (factor, Upsilon)
+            # Of a slow plant a small rest takes more steps than all leaps.
+            left = short * radius ** (STEPS_BETWEEN_LEAPS * MOST_LEAPS)
+            return None if short <= ROUNDED_GAINS and left <= SETTLED_GAINS else (factor, Upsilon)
         factor = np.asarray(np.linalg.qr(np.hstack([factor, further]).T, mode="r")).T
         transition = transition @ transition
     return None
