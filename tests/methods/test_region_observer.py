@@ -429,3 +429,29 @@ def test_a_model_in_which_nothing_moves_and_an_output_among_the_ranges_are_refus
         obsynth.region_observer(static, region={"x": [-2, 2]}, sample_time=0.1, goal="decay")
     with pytest.raises(SpecError, match="names 'l1'; there are: h1, h2, leak, out, q"):
         obsynth.region_observer(tanks(), region={"l1": [0.1, 1]}, sample_time=STEP, noise=NOISE)
+
+
+def test_readings_of_any_size_end_no_run(design: ObserverDesign, tmp_path: Path) -> None:
+    log, left = _log(), design.over_region[1].forgetting
+    log.loc[150, "l1"], log.loc[151, "l1"], log.loc[250, "q"] = 1e9, -1e9, 1e12
+    obsynth.run_on_data(design, log.drop(columns="truth"), out=tmp_path / "out.csv")
+    found = pd.read_csv(tmp_path / "out.csv")
+    assert (found.status[150 : 151 + left] == "out").all()
+    good = found.status[300:] == "ok"
+    assert good.sum() > 50
+    assert np.abs(found["fhat[leak]"] - log.truth)[300:][good].max() < 1e-3
+
+
+def test_an_input_that_is_none_of_the_equations_is_out() -> None:
+    model = DAEModel(
+        {"a": "der(x) = -x + 0.2 * x ** 3 + sqrt(u)"}, {"y": "x"}, states={"x": 0.0}, inputs={"u": 0.0}, parameters={},
+    )  # fmt: skip
+    observer = obsynth.region_observer(model, region={"x": [-1, 1]}, sample_time=0.1, goal="decay").over_region[1]
+    u = np.full((60, 1), 0.04)
+    u[20] = -1.0
+    rows, claimed = observer.record(np.full((60, 1), 0.2), u)
+    assert claimed[:20].all()
+    assert not claimed[20]
+    assert np.isfinite(rows[:20]).all()
+    assert np.isfinite(rows[21:]).all()
+    assert claimed[-1]
