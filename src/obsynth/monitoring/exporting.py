@@ -16,6 +16,7 @@ from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, FOLLOWED_ROWS, 
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import (
     FOLLOWED_MOST,
+    MOST_OF_START,
     OWN_MOST,
     ROOM_OF_START,
     LearnedRule,
@@ -172,7 +173,7 @@ class LearnedMonitorInC:
             "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
             "MONITOR_FOLLOW_LATER": later, "MONITOR_FOLLOW_LATER_IN_ALARM": later_in_alarm,
             "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
-            "MONITOR_ROOM": ROOM_OF_START,
+            "MONITOR_ROOM": ROOM_OF_START, "MONITOR_MOST_OF_START": MOST_OF_START,
             "MONITOR_SWING": SWING, "MONITOR_LEAST_SWINGS": LEAST_SWINGS, "MONITOR_SWING_ROOM": SWING_ROOM,
             "MONITOR_SWING_KEPT": 1.0 - 1.0 / SWING_MEMORY, "MONITOR_ROW_KEPT": 1.0 - 1.0 / ROW_MEMORY,
         }  # fmt: skip

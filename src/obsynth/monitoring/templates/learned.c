@@ -446,8 +446,8 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
     for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
         m->scores[i] = 0;
     }
-    /* Where most of these rows were in alarm, levels rise by what it reached. */
-    if (2 * m->stood > m->begun) {
+    /* Where nearly all of these rows were in alarm, levels rise by what it reached. */
+    if ((REAL)m->stood > MONITOR_MOST_OF_START * (REAL)m->begun) {
         REAL root = m->roots / (REAL)m->stood;
         REAL room = MONITOR_ROOM * root * root;
         m->room = room > m->room ? room : m->room;

@@ -43,10 +43,10 @@ FOLLOWED_MOST = 3.0
 #: offset that is larger stays an alarm.
 OWN_MOST = 10.0
 
-#: Where most rows of a start that is taken for usual were in alarm, levels rise by so many times what statistics were
-#: there (the mean of their roots, so that wrong samples say little): what is off is known at the inputs of these rows
-#: alone, and does something else at others.
-ROOM_OF_START = 2.0
+#: Where more than this share of a start that is taken for usual was in alarm it stood nearly from the first row on, and
+#: levels rise by so many times what statistics were there (the mean of their roots, so that wrong samples say little):
+#: what is off is known at the inputs of these rows alone, and does something else at others.
+MOST_OF_START, ROOM_OF_START = 0.75, 2.0
 
 #: While a level is passed the offset is followed so many times more slowly: what has come quickly stays an alarm.
 SLOWER_IN_ALARM = 10.0
@@ -102,7 +102,7 @@ class LearnedRule(Rule):
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
     that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had,
-    and are followed from then on; where most of these rows were in alarm, levels rise by what the alarm reached.
+    and are followed from then on; where nearly all of them were in alarm, levels rise by what it reached.
 
     Where means of whitened rows and likelihood ratios swing to both sides their levels rise by what they reach there:
     the noise has become slower than it was, as a fault would stay on one side."""
@@ -319,7 +319,7 @@ class LearnedRule(Rule):
         if begun not in OWN_ROWS or not state.alarmed or not np.isfinite(own).all():
             return state
         slow, centres = np.split(own / begun, [len(white)])
-        room = ROOM_OF_START * (state.roots / state.stood) ** 2 if 2 * state.stood > begun else 1.0
+        room = ROOM_OF_START * (state.roots / state.stood) ** 2 if state.stood > MOST_OF_START * begun else 1.0
         return state._replace(
             slow=slow, centres=centres, room=max(state.room, room), white=np.zeros_like(state.white),
             means=np.zeros_like(state.means), scores=np.zeros_like(state.scores), alarmed=0, ended=begun,
