@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from benchmarks.campaigns._rational_plants import drawn_plant
+from scipy.linalg import solve_continuous_lyapunov
 
 import obsynth
 from obsynth.methods.functional_filter import kalman_gain, rates, synthesis
@@ -491,3 +492,22 @@ def test_a_fast_state_that_no_output_shows_does_not_hurry_the_default(dt: float,
     beside = obsynth.DescriptorSystem(A=np.diag([own, mode]), Bf=[[1.0], [0.0]], C=[[1.0, 0.0]], **noise)
     decays = [obsynth.functional_filter(plant).certificate.claims["decay"] for plant in (alone, beside)]
     assert decays[1] == pytest.approx(decays[0], rel=0.01)
+
+
+def test_a_sensor_that_hardly_differs_is_not_read_for_what_only_the_difference_shows() -> None:
+    """The difference of both shows a step in time, with 900 times the noise: a slower walk is taken, and said."""
+    rng = np.random.default_rng([8, 8])
+    n = int(rng.integers(2, 7))
+    a = rng.standard_normal((n, n))
+    a -= (np.max(np.linalg.eigvals(a).real) + rng.uniform(0.1, 1.0)) * np.eye(n)
+    c = rng.standard_normal((int(rng.integers(1, 3)), n))
+    bf, other = rng.standard_normal((n, 1)), rng.standard_normal((1, n))
+    noises = []
+    for outputs in (c, np.vstack([c, c[:1] + 1e-3 * other])):
+        plant = obsynth.DescriptorSystem(A=a, C=outputs, Bf=bf, Dw=0.1 * np.eye(len(outputs)))
+        design = obsynth.functional_filter(plant)
+        o = design.observer
+        covariance = solve_continuous_lyapunov(o.Az, -0.01 * o.By @ o.By.T)
+        noises.append(np.sqrt((o.Cz[o.fault_rows] @ covariance @ o.Cz[o.fault_rows].T)[0, 0]))
+    assert noises[1] <= noises[0]
+    assert any("with larger ones less, and over 20 times as much noise" in note for note in design.notes)

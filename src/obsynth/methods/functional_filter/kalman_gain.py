@@ -148,6 +148,7 @@ class KalmanGain:
     innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
     covariance: FloatArray | None = None  # (n, n), of the errors of the prediction; ``None``: of poles
     step_time_and_miss: tuple[float, float] | None = None  # by default: s, share of a step missing then
+    noisier_if_faster: bool = False  # faster walks show more of a step then, with too much noise
     shares: tuple[float, float] = (0.0, 0.0)  # of noise that states and exact rows were taken to have besides
 
 

@@ -24,6 +24,8 @@ from obsynth.methods.functional_filter.kalman_gain import (
     kalman_gain,
 )
 from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov
+from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
@@ -39,6 +41,10 @@ AS_CLOSE = 0.05
 #: Where no walk shows more, it has so many times as long, this often: the slowest of all would show nothing ever, and
 #: is taken only where rounding hides what faster ones show.
 NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
+
+#: A walk that shows a step in time makes at most so many times the noise of the slowest one that shows half of it then:
+#: what sensors that hardly differ show of the rest is not worth more.
+MOST_NOISE = 20.0
 
 #: Default gains move poles whose errors need longer than so many settling times of the plant to decay; where no gain
 #: does so, those of errors that would stay in any run.
@@ -90,9 +96,9 @@ def default_rates(
             found = None
         if found is not None and exactly.missed(found.exponent, found.seconds) <= found.most:
             gain = _required_gain(exactly.gain(found.exponent))
-            return _at(model, 10.0**found.exponent * unit, gain, found.seconds, lag)
+            return _at(model, 10.0**found.exponent * unit, gain, found, lag)
     found = _slowest_walk(exactly, seconds, longer)
-    return _at(model, 10.0**found.exponent * unit, _required_gain(exactly.gain(found.exponent)), found.seconds, lag)
+    return _at(model, 10.0**found.exponent * unit, _required_gain(exactly.gain(found.exponent)), found, lag)
 
 
 class _TriedGains:
@@ -116,6 +122,17 @@ class _TriedGains:
             self.gains[exponent] = gain
         return self.gains[exponent]
 
+    def noise(self, exponent: float) -> float:
+        """Return what noise does to the estimates with a gain, in sizes of the faults, at worst."""
+        model, gain = self.model, _required_gain(self.gain(exponent))
+        closed, driven, read = model.A - gain.K @ model.C, model.N - gain.K @ model.M, model.estimate
+        if model.dt > 0.0:
+            covariance = output_covariance(closed, driven, read, np.zeros((len(read), driven.shape[1])))
+        else:
+            covariance = read @ continuous_lyapunov(closed, -driven @ driven.T) @ read.T
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return float(np.max(deviations / np.maximum(model.fault_sizes, SMALLEST), initial=0.0))
+
     def missed(self, exponent: float, seconds: float) -> float:
         """Return what estimates miss of a step after a time, infinite without a gain."""
         gain = self.gain(exponent)
@@ -128,6 +145,7 @@ class _Walk(NamedTuple):
     exponent: float
     seconds: float
     most: float
+    noisier: bool = False  # whether faster ones show more, with too much noise
 
 
 def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
@@ -151,6 +169,9 @@ def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
         close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
         high = next(e for e, miss in zip(exponents, misses, strict=True) if gains.gain(e) is not None and miss <= close)
         return _Walk(high, seconds, close)
+    half = next(e for e, miss in zip(exponents, misses, strict=False) if miss <= NOTHING_SHOWN)
+    if gains.noise(high) > MOST_NOISE * gains.noise(half):
+        return _Walk(half, seconds, NOTHING_SHOWN, noisier=True)
     if gains.roughly and len(misses) > 1:
         return _Walk(_by_interpolation(gains, high, seconds), seconds, RATE_REACHED)
     low = high - 1.0
@@ -185,11 +206,12 @@ def _by_interpolation(gains: _TriedGains, exponent: float, seconds: float) -> fl
 
 
 def _at(
-    model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int
+    model: FilterModel, walks: FloatArray, gain: KalmanGain, found: _Walk, lag: int
 ) -> tuple[FloatArray, KalmanGain]:
     """Return walks, and their gain with when it shows a step."""
-    slow_gain = _forgetting_gain(model, walks, gain, seconds, lag)
-    return walks, replace(slow_gain, step_time_and_miss=(seconds, step_misses(model, slow_gain, seconds)))
+    slow_gain = _forgetting_gain(model, walks, gain, found.seconds, lag)
+    shown = (found.seconds, step_misses(model, slow_gain, found.seconds))
+    return walks, replace(slow_gain, step_time_and_miss=shown, noisier_if_faster=found.noisier)
 
 
 def _forgetting_gain(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:

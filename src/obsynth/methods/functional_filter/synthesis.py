@@ -31,7 +31,7 @@ from obsynth.methods.functional_filter.kalman_gain import (
 )
 from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.parity_relation import SAMPLES, is_large, relation_model
-from obsynth.methods.functional_filter.rates import MOST_LONGER, default_rates, settling_time
+from obsynth.methods.functional_filter.rates import MOST_LONGER, MOST_NOISE, default_rates, settling_time
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
@@ -68,7 +68,7 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
         gains, rates, step_times = _gains(noisy, models, method, longer)
         parts = _parts(gains, method)
         observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, method))
-        if not any(seconds > settling_time(plant) for seconds, _ in step_times) or _is_above_rounding(plant, observer):
+        if not any(seconds > settling_time(plant) for seconds, *_ in step_times) or _is_above_rounding(plant, observer):
             break
     progress("building the realisation and its certificate")
     if gains and contraction_of(observer) is None:
@@ -144,7 +144,7 @@ def _parts(gains: Sequence[_ModelGain], method: FunctionalFilter, *, triangular:
 
 def _gains(
     plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter, longer: int
-) -> tuple[list[_ModelGain], list[FloatArray], list[tuple[float, float]]]:
+) -> tuple[list[_ModelGain], list[FloatArray], list[tuple[float, float, bool]]]:
     """Return models of the filters with their gains, the walks of their fault models' states, and when steps are seen
     with walks by default."""
     if method.poles is not None and models:
@@ -159,7 +159,8 @@ def _gains(
         else:
             model, walks, gain = low
         rates.append(walks)
-        step_times += [] if gain.step_time_and_miss is None else [gain.step_time_and_miss]
+        if gain.step_time_and_miss is not None:
+            step_times.append((*gain.step_time_and_miss, gain.noisier_if_faster))
         gains.append((model, gain))
     return gains, rates, step_times
 
@@ -282,16 +283,21 @@ def _silent_sensor_notes(plant: DescriptorSystem, gains: Sequence[_ModelGain]) -
 
 
 def _notes(
-    plant: DescriptorSystem, slowest: float, rates: Sequence[FloatArray], step_times: Sequence[tuple[float, float]]
+    plant: DescriptorSystem,
+    slowest: float,
+    rates: Sequence[FloatArray],
+    step_times: Sequence[tuple[float, float, bool]],
 ) -> list[str]:
     notes = []
     unit = "per sample" if plant.dt > 0.0 else "per square root of a second"
     if step_times:
         largest = float(max(np.max(walk, initial=0.0) for walk in rates))
-        seconds, missed = (max(values) for values in zip(*step_times, strict=True))
-        close = (
-            "" if missed <= RATE_REACHED else f" (with any intensity, up to {missed:.0%} of it are still missing then)"
-        )
+        seconds, missed, noisier = (max(values) for values in zip(*step_times, strict=True))
+        close = f" (up to {missed:.0%} of it are still missing then; with larger ones less, and over {MOST_NOISE:g} "
+        close += "times as much noise)"
+        if not noisier:
+            close = f" (with any intensity, up to {missed:.0%} of it are still missing then)"
+        close = "" if missed <= RATE_REACHED else close
         notes.append(
             f"fault_rate was not given: a random-walk intensity of {largest:.3g} {unit} is the slowest with which a "
             f"step is estimated after {duration(seconds)}{close}. A delay reduces the noise only relative to a "
