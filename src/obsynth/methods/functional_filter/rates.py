@@ -6,6 +6,7 @@ M_j`` from the error covariance.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -123,15 +124,21 @@ class _TriedGains:
         return self.gains[exponent]
 
     def noise(self, exponent: float) -> float:
-        """Return what noise does to the estimates with a gain, in sizes of the faults, at worst."""
+        """Return what noise does to the estimates with a gain, in sizes of the faults, at worst; NaN, which decides
+        nothing, where errors hardly decay."""
         model, gain = self.model, _required_gain(self.gain(exponent))
         closed, driven, read = model.A - gain.K @ model.C, model.N - gain.K @ model.M, model.estimate
         if model.dt > 0.0:
             covariance = output_covariance(closed, driven, read, np.zeros((len(read), driven.shape[1])))
         else:
-            covariance = read @ continuous_lyapunov(closed, -driven @ driven.T) @ read.T
+            with warnings.catch_warnings(action="error", category=RuntimeWarning):
+                try:
+                    covariance = read @ continuous_lyapunov(closed, -driven @ driven.T) @ read.T
+                except RuntimeWarning:
+                    return np.nan
         deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return float(np.max(deviations / np.maximum(model.fault_sizes, SMALLEST), initial=0.0))
+        worst = float(np.max(deviations / np.maximum(model.fault_sizes, SMALLEST), initial=0.0))
+        return worst if np.isfinite(worst) else np.nan
 
     def missed(self, exponent: float, seconds: float) -> float:
         """Return what estimates miss of a step after a time, infinite without a gain."""
