@@ -115,6 +115,23 @@ _PUBLIC_PACKAGES = ("conditions", "plotting", "types")
 
 __all__ = sorted([*_PUBLIC_HOMES, "conditions"])
 
+#: What other libraries call functions of this one.
+_OTHER_NAMES = {
+    **dict.fromkeys(("kalman", "kalman_filter", "KalmanFilter", "lqe", "dlqe"), "descriptor_kalman"),
+    **dict.fromkeys(("ekf", "EKF", "ExtendedKalmanFilter"), "extended_kalman"),
+    **dict.fromkeys(("uio", "UIO", "unknown_input_observer", "place", "pi_observer"), "ui_pi_observer"),
+    **dict.fromkeys(("luenberger", "luenberger_observer", "observer"), "pd_observer"),
+    **dict.fromkeys(("hinf", "hinf_filter", "h2_filter"), "optimal_filter"),
+    **dict.fromkeys(("fault_detection", "residual_generator", "parity", "parity_space"), "detection_filter"),
+    **dict.fromkeys(("ss", "dss", "StateSpace", "Plant", "System", "LTI"), "DescriptorSystem"),
+    **dict.fromkeys(("c2d", "sample", "sample_system"), "discretise"),
+    **dict.fromkeys(("lmi", "lmis"), "conditions"),
+    **dict.fromkeys(("plot", "plots"), "plotting"),
+    **dict.fromkeys(("load_gains", "load_design", "read"), "load"),
+    "save": "ObserverDesign.save",
+    "report": "html_report",
+}
+
 
 def _conditions_of_design(design: Any) -> Any:
     from obsynth.methods.engines.conditions_of_designs import conditions_of
@@ -234,24 +251,6 @@ if find_spec("obsynth.monitoring") is not None:
     )
 if find_spec("obsynth.studies") is not None:
     register(robustness=_robustness, run_many=_run_many, text_of_evaluation=_text_of_evaluation)
-
-
-#: What other libraries call functions of this one.
-_OTHER_NAMES = {
-    **dict.fromkeys(("kalman", "kalman_filter", "KalmanFilter", "lqe", "dlqe"), "descriptor_kalman"),
-    **dict.fromkeys(("ekf", "EKF", "ExtendedKalmanFilter"), "extended_kalman"),
-    **dict.fromkeys(("uio", "UIO", "unknown_input_observer", "place", "pi_observer"), "ui_pi_observer"),
-    **dict.fromkeys(("luenberger", "luenberger_observer", "observer"), "pd_observer"),
-    **dict.fromkeys(("hinf", "hinf_filter", "h2_filter"), "optimal_filter"),
-    **dict.fromkeys(("fault_detection", "residual_generator", "parity", "parity_space"), "detection_filter"),
-    **dict.fromkeys(("ss", "dss", "StateSpace", "Plant", "System", "LTI"), "DescriptorSystem"),
-    **dict.fromkeys(("c2d", "sample", "sample_system"), "discretise"),
-    **dict.fromkeys(("lmi", "lmis"), "conditions"),
-    **dict.fromkeys(("plot", "plots"), "plotting"),
-    **dict.fromkeys(("load_gains", "load_design", "read"), "load"),
-    "save": "ObserverDesign.save",
-    "report": "html_report",
-}
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, without_opening
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock, without_algebraic_states
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
@@ -22,7 +22,6 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.recursive.steady_observer import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
@@ -142,7 +141,7 @@ def candidate(
         designed_for: Any = plant if in_own_time else sampled
         if not in_own_time and plant.dt > 0.0 and plant.nx > sampled.nx:
             # With the way back to the algebraic states, which are estimated as well.
-            designed_for = eliminate_algebraic_states(plant)
+            designed_for = without_algebraic_states(plant)
         made = maker(designed_for, method, options)
         observer = _sampled(made, sampled.dt)
     except ObsynthError as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from obsynth.numerics.linear_recursions import impulse_responses
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.simulation.linear import stabilising_feedback
 
@@ -82,10 +84,17 @@ class FaultFigures:
         return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
 
 
+# Methods and figures ask for that of the same plant, which never changes.
+@lru_cache(maxsize=2)
+def without_algebraic_states(plant: DescriptorSystem) -> Transformation:
+    """Return a sampled plant without algebraic states, with the way back."""
+    return eliminate_algebraic_states(plant)
+
+
 def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSystem:
     """Return the plant sampled, in its own time where it is so already, without algebraic states."""
     if plant.dt > 0.0:
-        return eliminate_algebraic_states(plant).plant
+        return without_algebraic_states(plant).plant
     return discretise(plant, sample_time).plant
 
 

@@ -1,4 +1,4 @@
-"""Bounds as short texts, rounded outwards: what is printed is a bound as well."""
+"""Bounds in a few digits, rounded outwards: what is printed is a bound as well."""
 
 from __future__ import annotations
 
@@ -6,17 +6,27 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 
 
-def upper_text(bound: float, digits: int = 4) -> str:
+def upper(bound: float, digits: int) -> float:
     """Return an upper bound in a few digits, the last rounded up."""
-    return _text(bound, digits, ROUND_CEILING)
+    return _rounded(bound, digits, ROUND_CEILING)
+
+
+def lower(bound: float, digits: int) -> float:
+    """Return a lower bound in a few digits, the last rounded down."""
+    return _rounded(bound, digits, ROUND_FLOOR)
+
+
+def upper_text(bound: float, digits: int = 4) -> str:
+    """Return an upper bound as a text in a few digits, the last rounded up."""
+    return f"{upper(bound, digits):.{digits}g}"
 
 
 def lower_text(bound: float, digits: int = 4) -> str:
-    """Return a lower bound in a few digits, the last rounded down."""
-    return _text(bound, digits, ROUND_FLOOR)
+    """Return a lower bound as a text in a few digits, the last rounded down."""
+    return f"{lower(bound, digits):.{digits}g}"
 
 
-def _text(bound: float, digits: int, rounding: str) -> str:
+def _rounded(bound: float, digits: int, way: str) -> float:
     if not math.isfinite(bound):
-        return f"{bound:g}"
-    return f"{float(Context(digits, rounding).create_decimal(repr(float(bound)))):.{digits}g}"
+        return bound
+    return float(Context(digits, way).create_decimal(repr(float(bound))))

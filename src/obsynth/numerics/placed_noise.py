@@ -41,5 +41,6 @@ class PlacedNoise:
 
 def _discrete_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
     """Return X with ``X = a X a' + weight``, of stable ``a``, by way of continuous time: a search asks for many."""
-    ahead = np.linalg.inv(a + np.eye(len(a)))
-    return continuous_lyapunov((a - np.eye(len(a))) @ ahead, -2.0 * ahead @ weight @ ahead.T)
+    from scipy.linalg import solve_discrete_lyapunov
+
+    return np.asarray(solve_discrete_lyapunov(a, weight, method="bilinear"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -14,6 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import check_fields, is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import lower, upper
 from obsynth.numerics.suggestions import there_are
 
 _KEYS = ("nominal", "tolerance", "range", "unit")
@@ -42,23 +42,18 @@ def shown(value: float, unit: str = "") -> str:
 
 def _in_few_digits(item: Constant) -> tuple[float, float]:
     """Return a range inside that of a constant, so that what holds for the latter holds for what a text says."""
-    low, high = _rounded(item.low, ROUND_CEILING), _rounded(item.high, ROUND_FLOOR)
+    low, high = upper(item.low, RANGE_DIGITS), lower(item.high, RANGE_DIGITS)
     return (low, high) if low < high else (item.low, item.high)
-
-
-def _rounded(value: float, way: str) -> float:
-    """Return a number in the digits of a text."""
-    return float(Context(RANGE_DIGITS, way).create_decimal(repr(float(value))))
 
 
 def shown_bound(value: float, unit: str = "") -> str:
     """Return a bound in the digits of a text, rounded down: what holds for a bound holds for a lower one."""
-    return shown(_rounded(value, ROUND_FLOOR), unit)
+    return shown(lower(value, RANGE_DIGITS), unit)
 
 
 def deviations_told(count: float) -> str:
     """Return so many standard deviations in words, rounded down: what holds for a bound holds for a lower one."""
-    return f"{shown(_rounded(count, ROUND_FLOOR))} standard deviation{'' if count == 1 else 's'}"
+    return f"{shown(lower(count, RANGE_DIGITS))} standard deviation{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)

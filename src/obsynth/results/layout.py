@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from io import StringIO
 
 from rich import box
@@ -19,6 +18,7 @@ from rich.text import Text
 
 from obsynth.files.tables import aligned
 from obsynth.numerics.arguments import is_number
+from obsynth.numerics.outward import lower, upper
 from obsynth.results.checks import OPEN_LOOP, Check, all_hold
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
@@ -70,27 +70,23 @@ def number(value: float, *, digits: int = 4) -> str:
 
 def upper_number(value: float, *, digits: int = 3) -> str:
     """Return an upper bound with a few significant digits, the last rounded up: what is printed is a bound as well."""
-    return _rounded(value, ROUND_CEILING, digits)
+    return _rounded(value, upper, digits)
 
 
 def lower_number(value: float, *, digits: int = 3) -> str:
     """Return a lower bound with a few significant digits, the last rounded down: what is printed is a bound as well."""
-    return _rounded(value, ROUND_FLOOR, digits)
+    return _rounded(value, lower, digits)
 
 
 def bound_number(value: float, side: str, *, digits: int = 4) -> str:
     """Return a number that bounds another one from a side, ``"at most"`` or ``"at least"``, rounded away from that one;
     any other to the nearest."""
-    rounding = {"at most": ROUND_CEILING, "at least": ROUND_FLOOR}.get(side)
+    rounding = {"at most": upper, "at least": lower}.get(side)
     return number(value, digits=digits) if rounding is None else _rounded(value, rounding, digits)
 
 
-def _rounded(value: float, rounding: str, digits: int) -> str:
-    if not is_number(value) or not math.isfinite(value) or value == 0.0:
-        return number(value, digits=digits)
-    exact = Decimal(repr(float(value)))
-    rounded = exact.quantize(Decimal(1).scaleb(exact.adjusted() + 1 - digits), rounding)
-    return number(float(rounded), digits=digits)
+def _rounded(value: float, rounding: Callable[[float, int], float], digits: int) -> str:
+    return number(rounding(value, digits) if is_number(value) else value, digits=digits)
 
 
 def duration(seconds: float, *, digits: int = 3) -> str:

@@ -25,7 +25,7 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     output_map, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
     if not observer.dt and direct.any() and _is_stable(observer.Az, observer.dt):
         return _largest(np.sum(direct * direct, axis=1))
-    return _stationary_deviation(observer.Az, observer.By @ noise, output_map, direct, observer.dt)
+    return stationary_deviation(observer.Az, observer.By @ noise, output_map, direct, observer.dt)
 
 
 def error_deviation(model: ErrorModel, lag: float | None = None) -> float:
@@ -37,7 +37,7 @@ def error_deviation(model: ErrorModel, lag: float | None = None) -> float:
     a, b, c, d = model.Az, model.noise, -scale * c, scale * direct
     if not dt and lag is not None:
         a, b, c, d = _behind_lag(a, b, c, d, lag)
-    return _stationary_deviation(a, b, c, d, dt)
+    return stationary_deviation(a, b, c, d, dt)
 
 
 def _inverse_sizes(plant: DescriptorSystem, fault_names: Sequence[str]) -> FloatArray:
@@ -46,7 +46,7 @@ def _inverse_sizes(plant: DescriptorSystem, fault_names: Sequence[str]) -> Float
     return np.asarray(1.0 / np.where(sizes > 0.0, sizes, 1.0)[:, None])
 
 
-def _stationary_deviation(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> float:
+def stationary_deviation(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> float:
     """Return the largest deviation of an output under white noise; infinite where it has none."""
     if not len(c):
         return 0.0

@@ -6,7 +6,6 @@ M_j`` from the error covariance.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import ObsynthError, SolverError
+from obsynth.methods.engines.sensor_noise import stationary_deviation
 from obsynth.methods.functional_filter.kalman_gain import (
     ASKED_AT,
     LEAST_SAMPLES,
@@ -25,8 +25,6 @@ from obsynth.methods.functional_filter.kalman_gain import (
     kalman_gain,
 )
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.matrix_equations import continuous_lyapunov
-from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
@@ -127,17 +125,10 @@ class _TriedGains:
         """Return what noise does to the estimates with a gain, in sizes of the faults, at worst; NaN, which decides
         nothing, where errors hardly decay."""
         model, gain = self.model, _required_gain(self.gain(exponent))
-        closed, driven, read = model.A - gain.K @ model.C, model.N - gain.K @ model.M, model.estimate
-        if model.dt > 0.0:
-            covariance = output_covariance(closed, driven, read, np.zeros((len(read), driven.shape[1])))
-        else:
-            with warnings.catch_warnings(action="error", category=RuntimeWarning):
-                try:
-                    covariance = read @ continuous_lyapunov(closed, -driven @ driven.T) @ read.T
-                except RuntimeWarning:
-                    return np.nan
-        deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        worst = float(np.max(deviations / np.maximum(model.fault_sizes, SMALLEST), initial=0.0))
+        driven = model.N - gain.K @ model.M
+        read = model.estimate / np.maximum(model.fault_sizes, SMALLEST)[:, None]
+        direct = np.zeros((len(read), driven.shape[1]))
+        worst = stationary_deviation(model.A - gain.K @ model.C, driven, read, direct, model.dt)
         return worst if np.isfinite(worst) else np.nan
 
     def missed(self, exponent: float, seconds: float) -> float:

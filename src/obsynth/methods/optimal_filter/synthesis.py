@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -46,6 +45,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import with_late_inputs
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.outward import lower_text, upper_text
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.standard_form import cayley, uncayley
 from obsynth.observers.linear.observer import LinearObserver
@@ -637,7 +637,4 @@ def bracketed(low: float, high: float) -> tuple[str, str]:
     gap = (high - low) / high if np.isfinite(high) and high > 0.0 else 1.0
     agreeing = -math.log10(gap) if gap > 0.0 else MOST_DIGITS
     digits = int(np.clip(agreeing + 2.0, FEWEST_DIGITS, MOST_DIGITS))
-    ends = ((low, ROUND_FLOOR), (high, ROUND_CEILING))
-    rounded = (float(Context(digits, way).create_decimal(repr(float(end)))) for end, way in ends)
-    below, above = (f"{end:.{digits}g}" for end in rounded)
-    return below, above
+    return lower_text(low, digits), upper_text(high, digits)
