@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,9 +39,9 @@ def continuous_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
     return _by_rows(scipy.linalg.solve_continuous_lyapunov, a, weight)
 
 
-def discrete_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return X with ``X = a X a' + weight``."""
-    return _by_rows(scipy.linalg.solve_discrete_lyapunov, a, weight)
+def discrete_lyapunov(a: FloatArray, weight: FloatArray, *, method: str | None = None) -> FloatArray:
+    """Return X with ``X = a X a' + weight``; ``method`` is SciPy's, which takes the slow one for small matrices."""
+    return _by_rows(partial(scipy.linalg.solve_discrete_lyapunov, method=method), a, weight)
 
 
 def continuous_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, **others: Any) -> FloatArray:

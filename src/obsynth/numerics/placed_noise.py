@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.matrix_equations import continuous_lyapunov
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,17 +30,11 @@ class PlacedNoise:
         """Return the mean square for a gain ``(n, ny)`` that makes the errors decay, and its slope in each entry."""
         a, driven, read = self.F - gain @ self.C, self.B - gain @ self.D, self.estimates
         if self.dt > 0.0:
-            covariance, gramian = _discrete_lyapunov(a, driven @ driven.T), _discrete_lyapunov(a.T, read.T @ read)
+            covariance = discrete_lyapunov(a, driven @ driven.T, method="bilinear")
+            gramian = discrete_lyapunov(a.T, read.T @ read, method="bilinear")
             moved = a @ covariance
         else:
             covariance, gramian = continuous_lyapunov(a, -driven @ driven.T), continuous_lyapunov(a.T, -read.T @ read)
             moved = covariance
         value = float(np.trace(read @ covariance @ read.T))
         return value, np.asarray(-2.0 * gramian @ (moved @ self.C.T + driven @ self.D.T))
-
-
-def _discrete_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return X with ``X = a X a' + weight``, of stable ``a``, by way of continuous time: a search asks for many."""
-    from scipy.linalg import solve_discrete_lyapunov
-
-    return np.asarray(solve_discrete_lyapunov(a, weight, method="bilinear"))
