@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -162,62 +163,72 @@ def export(
     target = _checked_target(path)
     suffix = target.suffix.lower()
     require_verified(design, unverified=unverified)
+    options = _Options(sample_time, fmi, thresholds, warm_up, monitor, precision, outliers)
     if checker and suffix != ".json":
         raise SpecError("checker is for proof files (.json): others need none.", path="checker")
     if suffix == ".json":
-        _require_fitting_options(
-            suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
-        )
+        options.require_fitting(suffix)
         as_designed = sample_time is None and outliers is None and not unverified
         return _write_proof(design, target, checker=checker, as_designed=as_designed)
     _require_writable(design, suffix, outliers)
-    _require_fitting_options(
-        suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
-    )
-    numbers = precision or "double"
+    options.require_fitting(suffix)
     if isinstance(design.observer, ScheduledObserver):
-        return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers, fmi)
+        return _write_scheduled(design, target, options)
     written: ExportedMonitor | None = None if monitor is None else registered("monitor_in_c")(monitor, design)
     if suffix == ".fmu":
-        from obsynth.exporting.fmu.archive import write_fmu
-
         if monitor is not None and written is None:
             raise SpecError(
                 "An FMU holds learned monitors and levels of outputs, not this monitor: write it as C (.c).",
                 path="monitor",
             )
-        made = write_fmu(
-            design,
-            target,
-            version=fmi or "2.0",
-            sample_time=sample_time,
-            thresholds=thresholds,
-            warm_up=warm_up,
-            monitor=written,
-            outliers=outliers,
-        )
-        return (made,)
+        return _write_fmu(design, target, options, written)
     if isinstance(design.observer, DAEObserver):
         if monitor is not None and written is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
         alarms = dae_alarms(design, thresholds, warm_up, written)
-        return write_dae_c(design, target, sample_time, alarms, numbers, outliers)
-    realisation = Realisation.of(design, sample_time, numbers)
-    if suffix != ".c":
-        return (write_atomically(target, _array_file(realisation.as_arrays(), design, suffix)),)
-    if is_window(design):
-        _require_own_threshold(monitor, thresholds, warm_up, numbers)
-        return _write_window(realisation, target, numbers)
-    if realisation.observer.dt == 0.0:
-        raise SpecError(
-            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
-        )
-    bounds = (
-        None
-        if monitor is None or written is not None
-        else registered("bound_of_monitor")(monitor, realisation.observer)
-    )
-    return _write_c(realisation, target, linear_alarms(realisation, thresholds, warm_up, written), bounds)
+        return write_dae_c(design, target, sample_time, alarms, options.numbers, outliers)
+    return _write_linear(design, target, options, written)
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What `export` was asked for besides the design and the file."""
+
+    sample_time: float | None  # s
+    fmi: str | None
+    thresholds: Mapping[str, float] | None
+    warm_up: float | None  # s
+    monitor: Monitor | None
+    precision: Literal["double", "float"] | None
+    outliers: Outliers | None
+
+    @property
+    def numbers(self) -> str:
+        """The type of the numbers in C."""
+        return self.precision or "double"
+
+    def require_fitting(self, suffix: str) -> None:
+        """Raise `SpecError` for what a file of this suffix does not take."""
+        if self.precision is not None and suffix != ".c":
+            raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
+        if self.monitor is not None and suffix not in (".c", ".fmu"):
+            raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
+        if self.fmi is not None and suffix != ".fmu":
+            raise SpecError("fmi is the version of an FMU (.fmu): other files have none.", path="fmi")
+        if suffix not in (".c", ".fmu") and (self.thresholds or self.warm_up is not None):
+            raise SpecError(
+                "Thresholds and warm-up are for C (.c) and an FMU (.fmu): other files hold no alarms.",
+                path="thresholds",
+            )
+
+    def require_own_threshold(self) -> None:
+        """Raise `SpecError` where a guaranteed test is given another threshold than its own."""
+        if self.monitor is not None or self.thresholds or self.warm_up is not None or self.numbers != "double":
+            raise SpecError(
+                "A guaranteed test has its own threshold, in doubles: leave monitor, thresholds, warm-up and precision "
+                "out.",
+                path="monitor",
+            )
 
 
 def _checked_target(path: str | Path) -> Path:
@@ -246,39 +257,69 @@ def _write_proof(design: ObserverDesign, target: Path, *, checker: bool, as_desi
     return (proof, copy_checker(proof.parent)) if checker else (proof,)
 
 
-def _write_scheduled(
-    design: ObserverDesign,
-    target: Path,
-    suffix: str,
-    monitor: Monitor | None,
-    thresholds: Mapping[str, float] | None,
-    warm_up: float | None,
-    sample_time: float | None,
-    numbers: str,
-    fmi: str | None,
+def _write_linear(
+    design: ObserverDesign, target: Path, options: _Options, written: ExportedMonitor | None
 ) -> tuple[Path, ...]:
-    """Write a scheduled observer as C or an FMU, or its matrices at the vertices."""
-    arrays = suffix not in (".c", ".fmu")
-    if arrays and sample_time is not None:
+    """Write a linear or recursive observer, or a guaranteed test, as C or as matrices."""
+    suffix = target.suffix.lower()
+    realisation = Realisation.of(design, options.sample_time, options.numbers)
+    if suffix != ".c":
+        return (write_atomically(target, _array_file(realisation.as_arrays(), design, suffix)),)
+    if is_window(design):
+        options.require_own_threshold()
+        return _write_window(realisation, target, options.numbers)
+    if realisation.observer.dt == 0.0:
         raise SpecError(
-            "The matrices at the vertices are those of the design: leave sample_time out.", path="sample_time"
+            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
         )
-    if arrays:
-        return (write_atomically(target, _array_file(scheduled_arrays(design), design, suffix)),)
-    if numbers != "double":
-        raise SpecError("A design over a region is written in doubles: leave precision out.", path="precision")
-    seconds = seconds_between_rows(design.scheduled[1], sample_time)
-    written = None if monitor is None else registered("monitor_in_c")(monitor, design, seconds)
-    if suffix == ".fmu":
-        from obsynth.exporting.fmu.archive import write_fmu
+    bounds = (
+        None
+        if options.monitor is None or written is not None
+        else registered("bound_of_monitor")(options.monitor, realisation.observer)
+    )
+    alarms = linear_alarms(realisation, options.thresholds, options.warm_up, written)
+    return _write_c(realisation, target, alarms, bounds)
 
-        options: Any = {"sample_time": sample_time, "thresholds": thresholds, "warm_up": warm_up, "monitor": written}
-        return (write_fmu(design, target, version=fmi or "2.0", **options),)
-    alarms = scheduled_alarms(design.scheduled[1], thresholds, warm_up, written)
+
+def _write_scheduled(design: ObserverDesign, target: Path, options: _Options) -> tuple[Path, ...]:
+    """Write a scheduled observer as C or an FMU, or its matrices at the vertices."""
+    suffix = target.suffix.lower()
+    if suffix not in (".c", ".fmu"):
+        if options.sample_time is not None:
+            raise SpecError(
+                "The matrices at the vertices are those of the design: leave sample_time out.", path="sample_time"
+            )
+        return (write_atomically(target, _array_file(scheduled_arrays(design), design, suffix)),)
+    if options.numbers != "double":
+        raise SpecError("A design over a region is written in doubles: leave precision out.", path="precision")
+    seconds = seconds_between_rows(design.scheduled[1], options.sample_time)
+    written = None if options.monitor is None else registered("monitor_in_c")(options.monitor, design, seconds)
+    if suffix == ".fmu":
+        return _write_fmu(design, target, options, written)
+    alarms = scheduled_alarms(design.scheduled[1], options.thresholds, options.warm_up, written)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     texts = scheduled_c_texts(design, prefix, header.name, alarms, seconds)
-    source, declared = (in_precision(text, numbers) for text in texts)
+    source, declared = (in_precision(text, options.numbers) for text in texts)
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
+
+
+def _write_fmu(
+    design: ObserverDesign, target: Path, options: _Options, written: ExportedMonitor | None
+) -> tuple[Path, ...]:
+    """Write an observer with its monitor as an FMU."""
+    from obsynth.exporting.fmu.archive import write_fmu
+
+    made = write_fmu(
+        design,
+        target,
+        version=options.fmi or "2.0",
+        sample_time=options.sample_time,
+        thresholds=options.thresholds,
+        warm_up=options.warm_up,
+        monitor=written,
+        outliers=options.outliers,
+    )
+    return (made,)
 
 
 def _write_window(realisation: Realisation, target: Path, numbers: str) -> tuple[Path, ...]:
@@ -300,40 +341,6 @@ def _require_writable(design: ObserverDesign, suffix: str, outliers: Outliers | 
             f"Design {design.name!r} is for a region of a nonlinear plant, whose steps are not written as files yet: "
             "it runs in Python (design.observer) and on logs (obsynth.run_on_data).",
             path="path",
-        )
-
-
-def _require_own_threshold(
-    monitor: Monitor | None, thresholds: Mapping[str, float] | None, warm_up: float | None, numbers: str
-) -> None:
-    """Raise `SpecError` where a guaranteed test is given another threshold than its own."""
-    if monitor is not None or thresholds or warm_up is not None or numbers != "double":
-        raise SpecError(
-            "A guaranteed test has its own threshold, in doubles: leave monitor, thresholds, warm-up and precision "
-            "out.",
-            path="monitor",
-        )
-
-
-def _require_fitting_options(
-    suffix: str,
-    *,
-    fmi: str | None,
-    thresholds: Mapping[str, float] | None,
-    warm_up: float | None,
-    monitor: Monitor | None,
-    precision: str | None,
-) -> None:
-    """Raise `SpecError` for what a file of this suffix does not take."""
-    if precision is not None and suffix != ".c":
-        raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
-    if monitor is not None and suffix not in (".c", ".fmu"):
-        raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
-    if fmi is not None and suffix != ".fmu":
-        raise SpecError("fmi is the version of an FMU (.fmu): other files have none.", path="fmi")
-    if suffix not in (".c", ".fmu") and (thresholds or warm_up is not None):
-        raise SpecError(
-            "Thresholds and warm-up are for C (.c) and an FMU (.fmu): other files hold no alarms.", path="thresholds"
         )
 
 

@@ -129,7 +129,42 @@ def plant_fields(
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
     problems = Problems()
     matrices, labels = _without_frames(stated_matrices, names)
-    a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
+    a = _square_state_matrix(matrices, problems)
+    nx = a.shape[0]
+    states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
+    problems.raise_if_any()
+    checked: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
+    for name, value in matrices.items():
+        if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
+            checked[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+    more = _appended(matrices, labels, checked, sensor_noise, problems)
+    sizes = {"x": nx, **signal_counts(checked, nx)}
+    unknown = _signals_not_counted(matrices, checked)
+    values: dict[str, Any] = {
+        name: problems.shaped(checked.get(name), name, (sizes[rows], sizes[columns]))
+        for name, rows, columns in MATRIX_LAYOUT
+        if not unknown.intersection((rows, columns))
+    }
+    values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
+    for signal, key in SIGNAL_FIELDS.items():
+        if signal in unknown or signal == "x":
+            continue
+        stated = _stated_names(key, signal, labels, matrices, of_sensors=more.get(key, ()), size=sizes[signal])
+        values[key] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=key))
+    if any(values.get(field) is None for field in SIGNAL_FIELDS.values()):
+        # What refers to signals by name cannot be judged.
+        problems.raise_if_any()
+    known, measured = {name for field in SIGNAL_FIELDS.values() for name in values[field]}, set(values["input_names"])
+    measured |= set(values["output_names"])
+    values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
+    values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))
+    problems.raise_if_any()
+    return values
+
+
+def _square_state_matrix(matrices: dict[str, Any], problems: Problems) -> FloatArray:
+    """Take A ``(nx, nx)`` out of the matrices; raise `SpecError` where it cannot be read or is not square."""
+    a: FloatArray = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
     if a.shape == (0, 0):
@@ -143,51 +178,38 @@ def plant_fields(
             " The first argument is E: give A=..., B=... and C=... by name." if _is_square(matrices["E"], nx) else ""
         )
         raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).{remedy}", path="A")
-    states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
-    problems.raise_if_any()
-    checked: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
-    for name, value in matrices.items():
-        if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
-            checked[name] = problems.collect(partial(matrix_or_picks, value, name, states))
-    more = _appended(matrices, labels, checked, sensor_noise, problems)
-    sizes = {"x": nx, **signal_counts(checked, nx)}
-    # What depends on a matrix that could not be read is not judged: its own message is enough.
+    return a
+
+
+def _signals_not_counted(matrices: Mapping[str, Any], checked: Mapping[str, FloatArray | None]) -> set[str]:
+    """Return the signals whose number only matrices tell that could not be read: what depends on it is not judged, as
+    the message of the matrix is enough."""
     broken = {name for name, value in matrices.items() if value is not None and checked.get(name) is None}
-    unknown = {
+    return {
         signal
         for signal, telling in COUNTED_BY.items()
         if broken.intersection(telling) and all(checked.get(name) is None for name in telling)
     }
-    values: dict[str, Any] = {
-        name: problems.shaped(checked.get(name), name, (sizes[rows], sizes[columns]))
-        for name, rows, columns in MATRIX_LAYOUT
-        if not unknown.intersection((rows, columns))
-    }
-    values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
-    for signal, key in SIGNAL_FIELDS.items():
-        if signal in unknown or signal == "x":
-            continue
-        own = plain_names(labels[key])
-        no_names = own is None or (isinstance(own, (list, tuple)) and not own)
-        stated = picked_names(matrices.get(_NAMED_BY.get(key, ""))) if no_names else own
-        extra = more.get(key, ())
-        if (
-            extra
-            and is_name_list(["-"] if stated is None else stated)
-            and (stated is None or len(stated) == sizes[signal] - len(extra))
-        ):
-            first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=key)
-            stated = (*first, *extra)
-        values[key] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=key))
-    if any(values.get(field) is None for field in SIGNAL_FIELDS.values()):
-        # What refers to signals by name cannot be judged.
-        problems.raise_if_any()
-    known, measured = {name for field in SIGNAL_FIELDS.values() for name in values[field]}, set(values["input_names"])
-    measured |= set(values["output_names"])
-    values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
-    values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))
-    problems.raise_if_any()
-    return values
+
+
+def _stated_names(
+    key: str,
+    signal: str,
+    labels: Mapping[str, Any],
+    matrices: Mapping[str, Any],
+    *,
+    of_sensors: tuple[str, ...],
+    size: int,
+) -> Any:
+    """Return the names of a kind of signal: as given, else those by which its matrix was picked; those of signals that
+    were given by the names of sensors are appended, where they are not among them."""
+    own = plain_names(labels[key])
+    no_names = own is None or (isinstance(own, (list, tuple)) and not own)
+    stated = picked_names(matrices.get(_NAMED_BY.get(key, ""))) if no_names else own
+    others = size - len(of_sensors)
+    if not of_sensors or not (stated is None or (is_name_list(stated) and len(stated) == others)):
+        return stated
+    return (*checked_names(stated, others, prefix=signal, what=key), *of_sensors)
 
 
 def _is_square(matrix: Any, rows: int) -> bool:

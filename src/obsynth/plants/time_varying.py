@@ -186,7 +186,9 @@ class TimeVaryingDescriptorSystem:
         """
         if not plant.is_discrete:
             raise SpecError(
-                "The plant is continuous in time: sample it first (transform: {sample_time: ...}).", path="dt"
+                "The plant is continuous in time: sample it first (transform: {sample_time: ...} in "
+                "a spec, obsynth.discretise in Python).",
+                path="dt",
             )
         if plant.nd:
             raise SpecError(

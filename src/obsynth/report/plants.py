@@ -53,7 +53,8 @@ _COLUMN_MEANINGS = (
 _TIME_CONDITIONS = {
     "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
     "and sample the observer afterwards (obsynth.sample_observer)",
-    "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
+    "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...} in a spec, "
+    "obsynth.discretise in Python)",
 }
 
 #: Conditions on what a spec says, which the plant cannot fail.
