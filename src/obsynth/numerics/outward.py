@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 
 
@@ -27,6 +26,4 @@ def lower_text(bound: float, digits: int = 4) -> str:
 
 
 def _rounded(bound: float, digits: int, way: str) -> float:
-    if not math.isfinite(bound):
-        return bound
     return float(Context(digits, way).create_decimal(repr(float(bound))))
