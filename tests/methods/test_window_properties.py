@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 from functools import cache
 from types import SimpleNamespace
@@ -398,3 +399,16 @@ def test_a_remainder_is_of_the_sample_time_that_was_asked_for(
     bounds = dict(zip(names, (size, 0.1, 0.2), strict=True))
     monkeypatch.setattr(regions, "bounded_model", lambda *_, **__: (None, bounds))
     assert regions.remainder_check(design, lambda _: asked).passed == passed
+
+
+def test_sizes_in_the_notes_of_a_bank_are_bounds() -> None:
+    """In six digits they are rounded up: of six numbers, those rounded to the nearest would hardly all be above."""
+    a = [[0.5, 0.1, 0.0], [0.0, 0.6, 0.2], [0.1, 0.0, 0.4]]
+    plant = obsynth.DescriptorSystem(None, a, np.zeros((3, 1)), np.eye(3), Bf=np.eye(3), dt=0.1)
+    noise = {name: 0.1 / 3.0**i for i, name in enumerate(plant.output_names)}
+    made = obsynth.guaranteed_test(plant, isolate=True, course="step", before=3, samples=7, noise_bound=noise)
+    told = re.findall(r"threshold ([^ ]+), ([^ ]+) is certain to be detected", " ".join(made.notes))
+    assert len(told) == plant.nf
+    for test, (threshold, certain) in zip(made.tests, told, strict=True):
+        assert 0.0 <= float(threshold) / test.threshold - 1.0 < 1e-5
+        assert 0.0 <= float(certain) / test.surely_found - 1.0 < 1e-5

@@ -41,6 +41,7 @@ from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, normalise, null_basis
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.outward import lower_text
 from obsynth.numerics.ranks import HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -404,7 +405,7 @@ def _existence(conditions: Sequence[Condition], convex: GainProblem, gamma: floa
         else proved_lower_bound(convex, solver="CLARABEL", best=best.injection, enough=gamma)
     )
     holds = bool(best.gain <= gamma or bound <= gamma)
-    detail = f"the best filter found has {best.gain:.9g}, and none with this T, N and W is below {bound:.9g}"
+    detail = f"the best filter found has {best.gain:.9g}, and none with this T, N and W is below {lower_text(bound, 9)}"
     source = "dual of (45), checked without the solver"
     claim = "gamma is not below the least gain for this T, N and W"
     return [*listed, Condition("gamma", claim, holds, gamma, bound, source, detail)]

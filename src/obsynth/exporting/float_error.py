@@ -6,6 +6,7 @@ import numpy as np
 
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import upper_text
 
 #: Relative rounding of a float, and of a double.
 UNIT = 2.0**-24
@@ -69,7 +70,7 @@ def float_error(realisation: Realisation) -> str:
     if bounds is None:
         return "Floats: no bound on the error of single precision was found, as its errors decay too slowly."
     names = realisation.observer.row_names
-    listed = ", ".join(f"{name} {bound:.2g}" for name, bound in zip(names, bounds, strict=True))
+    listed = ", ".join(f"{name} {upper_text(bound, 2)}" for name, bound in zip(names, bounds, strict=True))
     return (
         "Floats: a derived bound on the error against double precision, for complete samples whose deviations stay "
         f"within 1 unit each (n times as much for n units): {listed}"

@@ -20,6 +20,7 @@ from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter
 from obsynth.numerics.arguments import Count, arguments_checked, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
+from obsynth.numerics.outward import upper_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
@@ -117,7 +118,7 @@ class SensorSets:
             for sensor_set in self.sets:
                 numbers = (
                     f"{sensor_set.cost:g}",
-                    f"{sensor_set.threshold:.4g}",
+                    "none" if sensor_set.threshold is None else upper_text(sensor_set.threshold),
                     f"{sensor_set.samples}",
                     f"{sensor_set.sample_time:g}",
                 )

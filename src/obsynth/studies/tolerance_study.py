@@ -17,6 +17,7 @@ from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.residual_monitor import monitor
 from obsynth.numerics.arguments import arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
+from obsynth.numerics.outward import upper_text
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
@@ -180,7 +181,7 @@ def study_statement(result: Mapping[str, Any], options: Mapping[str, Any], diges
         + (
             f"no step of {result['fault']}"
             if least is None
-            else f"a step of {result['fault']} from {least:.4g}{unit} on"
+            else f"a step of {result['fault']} from {upper_text(least)}{unit} on"
         )
         for name, alarms, least in zip(
             result["monitors"], result["false_alarms"][last], result["least_faults"][last], strict=True

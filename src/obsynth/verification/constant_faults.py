@@ -15,6 +15,7 @@ import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import upper_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.extended_balls import Enclosed, ExtendedBall
@@ -176,10 +177,11 @@ def _as_it_runs(
         f"of plant and observer together: {missed:.2g} in exact arithmetic, and as it runs in double precision{sampled}"
     )
     if not settles(faults.model, SLOWEST_COUNTED) or _settling_time(observer) > 1.0 / SLOWEST_COUNTED:
-        bound = f"adds at most {rounding:.2g}" if np.isfinite(rounding) else "has no proved bound"
+        bound = f"adds at most {upper_text(rounding, 2)}" if np.isfinite(rounding) else "has no proved bound"
         slow = "once plant and observer have settled, which takes so long (over 1e5 samples) that it is not counted"
         return missed, f"{detail}, rounding {bound} {slow}"
-    return float(rounded_up(np.asarray(missed + rounding), 1)), f"{detail}, rounding adds at most {rounding:.2g}"
+    detail = f"{detail}, rounding adds at most {upper_text(rounding, 2)}"
+    return float(rounded_up(np.asarray(missed + rounding), 1)), detail
 
 
 def _settling_time(observer: LinearObserver) -> float:

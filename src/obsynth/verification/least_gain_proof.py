@@ -22,6 +22,7 @@ import numpy as np
 from flint import fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import lower_text
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import squared_norm
@@ -204,7 +205,7 @@ def least_gain_row(
         bool(holds),
         "disturbances that no gain can attenuate, exactly; sums in ball arithmetic",
         "proved",
-        f"proved: at least {bound:.9g}",
+        f"proved: at least {lower_text(bound, 9)}",
     )
 
 

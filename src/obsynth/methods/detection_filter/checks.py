@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.existence.ding2000 import conditions, unknown_inputs
+from obsynth.numerics.outward import upper_text
 from obsynth.numerics.spectra import abscissa
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, fitting_check, information
@@ -119,7 +120,8 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
     if not any(added):
         yield _together(claim, True, "the stored numbers meet the equations of the error exactly")
         return
-    detail = f"they add at most {added[0]:.2g} to the gain, and take {added[1]:.2g} from the sensitivity"
+    to_gain, from_sensitivity = (upper_text(share, 2) for share in added)
+    detail = f"they add at most {to_gain} to the gain, and take {from_sensitivity} from the sensitivity"
     less, more = np.nextafter(gain - added[0], -np.inf), np.nextafter(sensitivity + added[1], np.inf)
     holds = bool(np.all(np.isfinite(added))) and less > 0.0 and gain_is_proved(felt, less, witness) and shows(more)
     yield _together(claim, holds, detail if holds else _why_not(plant))

@@ -15,6 +15,7 @@ from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.norms import response
+from obsynth.numerics.outward import lower_text, upper_text
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
@@ -188,9 +189,10 @@ def _gain_witnesses(transfer: Transfer, bound: float, units: _OwnUnits) -> Itera
 
 def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:
     notes = (
-        f"Unknown inputs and noise reach the residuals with a gain of at most {claims['disturbance_gain']:.7g}, the "
-        f"faults with at least {claims['fault_sensitivity']:.4g} from {claims['band_from']:g} to {claims['band_to']:g} "
-        f"rad/s (least at {claims['frequency']:.3g} rad/s).",
+        "Unknown inputs and noise reach the residuals with a gain of at most "
+        f"{upper_text(claims['disturbance_gain'], 7)}, the faults with at least "
+        f"{lower_text(claims['fault_sensitivity'])} from {claims['band_from']:g} to {claims['band_to']:g} rad/s (least "
+        f"at {claims['frequency']:.3g} rad/s).",
     )
     if np.isfinite(added_gain(plant, observer, *unknown_inputs(plant))):
         return notes

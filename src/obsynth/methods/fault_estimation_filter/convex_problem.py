@@ -11,6 +11,7 @@ from obsynth.errors import InfeasibleError, SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, identity_missed
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit, null_basis
+from obsynth.numerics.outward import upper_text
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
@@ -131,8 +132,8 @@ def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: Gain
     smallest = 1.0 / float(np.linalg.svd(prepared.detectability.Upsilon / outputs[:, None], compute_uv=False)[-1])
     if smallest >= bound:
         raise InfeasibleError(
-            f"No residual weight W with W Upsilon = I has a norm of {bound:.6g} or less: the least is {smallest:.6g}. "
-            "Raise residual_weight_limit.",
+            f"No residual weight W with W Upsilon = I has a norm of {bound:.6g} or less: the least is "
+            f"{upper_text(smallest, 6)}. Raise residual_weight_limit.",
             necessary=True,
             lower_bound=smallest,
         )

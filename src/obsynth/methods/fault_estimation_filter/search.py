@@ -15,6 +15,7 @@ from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.small_gains import POLISHING_UP_TO, PrintedInequality, small_gain_design
 from obsynth.numerics.central_filter import AT_THE_BOUND, LeastGain, least_level, search_by_bisection, search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit
+from obsynth.numerics.outward import lower_text
 
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
 SMALLEST_USEFUL_GAIN = 1e-3
@@ -175,8 +176,9 @@ def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, s
     if bound > gain:
         remedy = "" if problem.free_weight else ", or set weight: free"
         raise InfeasibleError(
-            f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= {bound:.6g}, and "
-            f"the best filter found has {best:.6g}. Ask for a larger gamma, leave it out for the least{remedy}.",
+            f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= "
+            f"{lower_text(bound, 6)}, and the best filter found has {best:.6g}. Ask for a larger gamma, leave it out "
+            f"for the least{remedy}.",
             necessary=False,
             lower_bound=bound,
         )

@@ -30,6 +30,7 @@ from obsynth.methods.guaranteed_test.problem import problem_of
 from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, padded, synthesise
 from obsynth.methods.method import Synthesis, silent
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import upper_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
@@ -151,12 +152,13 @@ def _bank_notes(
     for fault, (group, why) in enumerate(zip(groups, reasons, strict=True)):
         size, certain = claims[f"threshold[{names[fault]}]"], claims[f"surely_found[{names[fault]}]"]
         group_names = " or ".join(names[k] for k in group)
+        no_smaller = f" No smaller group can be isolated: {why}" if why else ""
         yield (
-            f"An alarm of {names[fault]} means {group_names}, as long as the bounds hold: threshold {size:.6g}, "
-            f"{certain:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
+            f"An alarm of {names[fault]} means {group_names}, as long as the bounds hold: threshold "
+            f"{upper_text(size, 6)}, {upper_text(certain, 6)} is certain to be detected.{no_smaller}"
         )
         listed = [
-            f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else f'{pairs[fault, other]:.6g}'}"
+            f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else upper_text(pairs[fault, other], 6)}"
             for other in range(plant.nf)
             if other != fault
         ]

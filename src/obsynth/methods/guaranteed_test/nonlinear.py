@@ -15,6 +15,7 @@ from obsynth.methods.guaranteed_test.existence import SOURCE, conditions
 from obsynth.methods.guaranteed_test.synthesis import synthesise
 from obsynth.methods.guaranteed_test.window_bounds import between, fault_of
 from obsynth.methods.method import Synthesis
+from obsynth.numerics.outward import upper_text
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.remainders import bounded_model, remainder_names
@@ -144,8 +145,9 @@ def synthesise_nonlinear(model: DAEModel, options: Any, *, progress: Callable[[s
     notes = [note for note in synthesis.notes if "no function" not in note and "least is not claimed" not in note]
     notes.insert(
         0,
-        f"The plant is nonlinear: the remainder of its linear model is at most {share.max():.3g} in a state or an "
-        "output, while all signals stay in the region, between samples too; known inputs and faults are held there"
+        f"The plant is nonlinear: the remainder of its linear model is at most {upper_text(share.max(), 3)} in a state "
+        "or an output, while all signals stay in the region, between samples too; known inputs and faults are held "
+        "there"
         + (". " if own.disturbance in ("any", "rate") else ", and unknown inputs. ")
         + "That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
     )

@@ -378,7 +378,7 @@ def _notes(
             "the smallest mean over the scenario; no function of these samples has a threshold below least over the "
             "tolerances either. No size is certain to be detected there: a fault of twice the threshold of its row may "
             "be needed, and more where the constants change the effect of the fault. For the nominal plant a fault of "
-            f"{2.0 * threshold:.4g} is certain to pass its threshold."
+            f"{upper_text(2.0 * threshold)} is certain to pass its threshold."
         )
     elif isinstance(problem.plant, DescriptorSystem) and problem.plant.uncertainty is not None:
         words.append(
@@ -407,7 +407,7 @@ def _notes_of_rows(
     rows = "every row from" if forever else f"the {len(of_row)} rows from"
     yield (
         f"{counted(len(thresholds), 'linear programme')} for {rows} k = {test_problem.samples} on, each proved: "
-        f"thresholds from {used.min():.6g} to {used.max():.6g}; the largest one is claimed."
+        f"thresholds from {upper_text(used.min(), 6)} to {upper_text(used.max(), 6)}; the largest one is claimed."
     )
     if without:
         yield (

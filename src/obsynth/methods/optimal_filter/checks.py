@@ -23,6 +23,7 @@ from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.outward import upper_text
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -100,7 +101,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     driven = "noise" if options["exact"] else "faults and noise together"
     driven = driven if weights is None else f"{driven}, each behind its weight"
     error = "error" if weights is None else "weighted error"
-    yield proof_row("gain", f"the {error} is at most {claims['gain']:.9g} times the {driven}", proof, source)
+    yield proof_row("gain", f"the {error} is at most {upper_text(claims['gain'], 9)} times the {driven}", proof, source)
     plant = _claimed_map(design).driven(plant)
     if "least" in claims:
         yield _least(design, plant)
@@ -235,7 +236,7 @@ def _among(design: ObserverDesign) -> str:
     if not setting.dependent:
         return ""
     names = ", ".join(design.linear[0].output_names[place] for place in setting.dependent)
-    return f" and a gain of at most {setting.answer_limit:.3g} from {names}"
+    return f" and a gain of at most {upper_text(setting.answer_limit, 3)} from {names}"
 
 
 def _claimed_map(design: ObserverDesign) -> FaultMap:

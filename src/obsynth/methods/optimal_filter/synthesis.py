@@ -569,7 +569,7 @@ def _statement(
         if dependent:
             few = "depends" if len(dependent) == 1 else "depend"
             of += f", whose gain from {', '.join(dependent)}, which {few} on the other outputs but for rounding,"
-            of += f" is at most {claims['answer_limit']:.3g}"
+            of += f" is at most {upper_text(claims['answer_limit'], 3)}"
         of = f"from disturbances and noise together, {of}"
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
     places = [row.found.fault_map.delays for row in curve]

@@ -11,6 +11,7 @@ from obsynth.errors import InfeasibleError
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.outward import lower_text
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -102,7 +103,8 @@ def require_possible(plant: DescriptorSystem, method: PdObserver, *, delta: floa
         if method.noise_gain <= least:
             raise InfeasibleError(
                 f"No observer has a noise gain of {method.noise_gain:.6g}: already in steady state the fault has to be "
-                f"computed from the outputs, which multiplies errors by {least:.6g} or more. Raise noise_gain.",
+                f"computed from the outputs, which multiplies errors by {lower_text(least, 6)} or more. Raise "
+                "noise_gain.",
                 necessary=True,
                 lower_bound=least,
             )

@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold, peak_gain
+from obsynth.numerics.outward import lower_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dead_times import delays_in_words, in_samples
 from obsynth.plants.descriptor import DescriptorSystem
@@ -200,7 +201,7 @@ class IntersampleErrorSystem:
         """Return what to say of modes that do not decay: up to which state rounding on them does not matter."""
         if not self.lasting_gain > 0.0 or not np.isfinite(limit):
             return ""
-        return f"; while no state of the plant exceeds {ADDED * limit / self.lasting_gain:.2g} in its unit"
+        return f"; while no state of the plant exceeds {lower_text(ADDED * limit / self.lasting_gain, 2)} in its unit"
 
     def at_any_stamps(self, sizes: FloatArray, observer: LinearObserver) -> float:
         """Return what straight lines between outputs add at any stamps at most ``dt`` apart; may be infinite."""

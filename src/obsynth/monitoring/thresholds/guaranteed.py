@@ -21,6 +21,7 @@ from obsynth.monitoring.thresholds.adaptive_monitor import over_box
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.outward import lower_text, upper_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -95,14 +96,14 @@ def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     # Bounds of states may show a fault of less than twice the least: that is then one of intervals.
     bounded = any(test.options.get(name) for name in ("state_bounds", "initial_bounds"))
     words = "estimates the fault to within less than" if bounded else "has a threshold below"
-    least = "" if np.isnan(test.least) else f", and no function of these samples {words} {test.least:.6g}"
+    least = "" if np.isnan(test.least) else f", and no function of these samples {words} {lower_text(test.least, 6)}"
     words = ""
     if isinstance(test.plant, DescriptorSystem):
         words = disturbances_in_words(window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options)))
     return (
         f"never passed without {' or '.join(group)} while disturbances and noise keep the bounds of the design"
         f"{f', for {words}' if words else ''}{least}; "
-        f"a fault {test.fault} of {test.surely_found:.6g} raises an alarm within {test.delay:g} s"
+        f"a fault {test.fault} of {upper_text(test.surely_found, 6)} raises an alarm within {test.delay:g} s"
     )
 
 
