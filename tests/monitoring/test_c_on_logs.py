@@ -602,8 +602,8 @@ def test_c_raises_levels_where_residuals_swing_as_a_run_does(tmp_path: Path) -> 
     log["y1"] = np.sin(np.arange(ROWS) / 8.0)
     low = 0.02 * told(design).levels
     low[0] *= 10.0
-    # With fewer logs the alarm would be ended, and all levels raised by what it had reached.
-    learned = replace(told(design), levels=low, logs=3)
+    # With fewer logs, or without offsets in them, the alarm would be ended, and levels raised by what it had reached.
+    learned = replace(told(design), levels=low, logs=3, drift_limits={})
     monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
     run = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0, recovered="none")
     assert any("swing to both sides" in text for text in run.warnings)

@@ -114,7 +114,7 @@ def test_two_logs_do_not_tell_an_offset_from_a_fault_either_and_three_do() -> No
         obsynth.run_on_data(
             pumped(), whole, monitor=obsynth.online_monitor(pumped(), "learned", normal=replace(learned(), **few))
         )
-        for few in ({"logs": 2, "memory": 0.0}, {"logs": 3, "memory": 0.0})
+        for few in ({"logs": 2, "memory": 0.0}, {"logs": 3, "memory": 0.0, "drift_limits": {}})
     ]
     two, three = (run.table["alarm"].ne("").to_numpy() for run in runs)
     assert two[:200].any()
@@ -157,7 +157,7 @@ def test_a_linear_filter_follows_what_one_log_does_not_tell_from_drifts() -> Non
     assert obsynth.learn_thresholds(design, lines(0), false_alarms="1 per 500 rows", sensor_drift=1.0).memory == 0.0
     before, now = (
         obsynth.online_monitor(design, "learned", normal=replace(learned, **few))
-        for few in ({"memory": 0.0, "logs": 3}, {})
+        for few in ({"memory": 0.0, "logs": 3, "drift_limits": {}}, {})
     )
 
     def alarmed(monitor: obsynth.types.Monitor, log: pd.DataFrame) -> np.ndarray:
@@ -190,3 +190,32 @@ def test_levels_rise_where_what_a_start_is_off_by_follows_the_inputs(monkeypatch
     assert found[0][1] == 0.0
     assert found[1][1] > 0.1
     assert [raised for _, _, raised in found] == [True, False]
+
+
+@pytest.mark.long
+def test_three_logs_without_offsets_end_an_alarm_of_the_start_and_three_with_offsets_do_not() -> None:
+    """They said that 0 % of healthy time is in alarm, and a sensor that was off by one deviation was an alarm for 88 to
+    94 % of a log of a two-mass drive."""
+    design, _ = filtered()
+    without, held = (
+        obsynth.learn_thresholds(
+            design, [lines(20 + i, rows=600, off=off) for i, off in enumerate(offs)], false_alarms="1 per 500 rows"
+        )
+        for offs in ((0.0, 0.0, 0.0), (-4.0, 4.0, 0.0))
+    )
+    assert 0.0 < without.drift_limits["y2"] < 2.0
+    assert f"y2 by {without.drift_limits['y2']:.2g}" in without.statement
+    assert "3 logs without offsets of sensors do not distinguish" in without.statement
+    assert not held.drift_limits
+    assert not held.takes_first_rows
+    assert "none of these 3 logs" not in held.statement
+    runs = []
+    for learned in (without, held, replace(without, drift_limits={})):
+        monitor = obsynth.online_monitor(design, "learned", normal=learned)
+        run = obsynth.run_on_data(design, lines(5, rows=600, off=3.0), monitor=monitor)
+        runs.append((run.table["alarm"].ne("").to_numpy(), run.warnings))
+    assert runs[0][0][:200].any()
+    assert not runs[0][0][200:].any()
+    assert any("3 logs without offsets of sensors, which do not" in text for text in runs[0][1])
+    assert runs[1][0].mean() < 0.02
+    assert runs[2][0][200:].mean() > 0.5

@@ -362,8 +362,8 @@ def test_runs_go_on_from_a_saved_state(tmp_path: Path) -> None:
 
 
 def test_row_by_row_is_the_same_as_at_once() -> None:
-    # Of one log, or two, the rule follows what is usual in a log.
-    found, rng = replace(learned(), memory=0.0, logs=3), np.random.default_rng(4)
+    # Of one log, or two, or of three without offsets, the rule follows what is usual in a log.
+    found, rng = replace(learned(), memory=0.0, logs=3, drift_limits={}), np.random.default_rng(4)
     rule = LearnedRule(found, watched_names(heated()))
     model, count = found.statistics.model, len(watched_names(heated()))
     rows = rng.standard_normal((400, count)) * 0.02

@@ -129,8 +129,9 @@ class LearnedThresholds:
     without_drift : tuple of str
         Sensors for which none is allowed for all the same, as nothing is known of their noise or of what a drift does.
     drift_limits : mapping of str to float
-        Of one log, where no drift is allowed for: by how many deviations of its noise, below one, a slow drift of a
-        sensor alarms for as long as it lasts; with a ``memory``, an offset that is there from the first row on.
+        Where no drift is allowed for: by how many deviations of its noise, of one log below one and of several below
+        four, a slow drift of a sensor alarms for as long as it lasts; with a ``memory``, an offset that is there from
+        the first row on.
     memory : float
         Rows over which slow offsets of the residuals are followed, and twice those over which faults are, so that they
         alarm nothing; zero: none is.  One log does not distinguish drifts of a plant from faults that come as slowly.
@@ -200,8 +201,8 @@ class LearnedThresholds:
     @property
     def takes_first_rows(self) -> bool:
         """Whether the first rows of a run are taken for what is usual in its log, where they alarm: the logs are too
-        few to show which offsets others have."""
-        return self.logs < LOGS_FOR_OFFSETS
+        few to show which offsets others have, or have none themselves, so that those of a few deviations alarm."""
+        return self.logs < LOGS_FOR_OFFSETS or bool(self.drift_limits)
 
     @property
     def statement(self) -> str:
@@ -254,6 +255,7 @@ class LearnedThresholds:
             )
         if self.takes_first_rows:
             few = "one log does" if self.logs == 1 else f"{self.logs} logs do"
+            few = few if self.logs < LOGS_FOR_OFFSETS else f"{self.logs} logs without offsets of sensors do"
             later = "" if self.memory else f", and followed over {FOLLOWED_ROWS:.6g} rows from then on"
             yield (
                 f"{few} not distinguish a fault that is there from the first row of a run on from an offset of that "
@@ -275,10 +277,16 @@ class LearnedThresholds:
                 if self.memory
                 else f"a slow drift of {limits} deviations of its noise alarms as long as it lasts"
             )
-            yield (
-                f"one log does not rule out that sensors drift otherwise in others, and {wrong}: give three normal "
-                "logs, or allow for it (sensor_drift)"
-            )
+            if self.logs == 1:
+                yield (
+                    f"one log does not rule out that sensors drift otherwise in others, and {wrong}: give three normal "
+                    "logs, or allow for it (sensor_drift)"
+                )
+            else:
+                yield (
+                    f"none of these {self.logs} logs holds such offsets of sensors that levels are above them, and "
+                    f"{wrong}: give normal logs that hold them, or allow for them (sensor_drift)"
+                )
 
     def _dependence_in_words(self) -> Iterator[str]:
         """Yield what it means that large residuals come together, and that wrong samples come in pairs."""

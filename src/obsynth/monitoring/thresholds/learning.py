@@ -45,6 +45,10 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 
+#: Deviations of its noise below which an offset of a sensor that alarms is told of one log, and of several: by so much
+#: sensors are off in healthy logs, and logs that hold such offsets raise the levels above what they do.
+FEW_DEVIATIONS, USUAL_DEVIATIONS = 1.0, 4.0
+
 #: One false alarm in so many rows, where nothing else is asked for.
 FALSE_ALARM_RATE = "1 per 1000 rows"
 
@@ -170,7 +174,6 @@ def learn_thresholds(
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
     without_room = np.flatnonzero([] if drifts is None else drifts.sensors_without())
     learned = replace(learned, memory=_memory(learned, logs))
-    is_one_log = drifts is None and len(logs.ends) == 1
     return replace(
         learned,
         notes=(
@@ -180,7 +183,7 @@ def learn_thresholds(
             *_notes_of_starts(design, output, learned),
         ),
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
-        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if is_one_log else {},
+        drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if drifts is None else {},
         ranges=_ranges(signals, deviations, output, white, learned, options["logs"]),
     )
 
@@ -255,14 +258,15 @@ def _drifts(runs: NormalRuns, logs: NormalLogs, offsets: FloatArray, most: int =
 def _drift_limits(
     runs: NormalRuns, logs: NormalLogs, offsets: FloatArray, learned: LearnedThresholds
 ) -> dict[str, float]:
-    """Return by which share of one of its deviations, ``offsets (ny,)``, a slow drift of a sensor alarms for as long as
-    it lasts, where it is below one: one log says nothing of those of other logs."""
+    """Return by how many of its deviations, ``offsets (ny,)``, a slow drift of a sensor alarms for as long as it lasts,
+    where these are few: one log says nothing of those of other logs, and several say nothing where they have none."""
     try:
         drifts = _drifts(runs, logs, offsets, LIMIT_ROWS)
     except SpecError:
         return {}
     columns = [watched_names(runs.design).index(name) for name in learned.columns]
-    limits = drift_limits(learned.statistics, learned.levels, drifts, columns)
+    most = FEW_DEVIATIONS if len(logs.ends) == 1 else USUAL_DEVIATIONS
+    limits = drift_limits(learned.statistics, learned.levels, drifts, columns, most=most)
     signals = runs.begun().signals
     names = signals.names[signals.inputs :]
     return {name: float(limit) for name, limit in zip(names, limits, strict=True) if np.isfinite(limit)}

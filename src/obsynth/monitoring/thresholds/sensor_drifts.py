@@ -95,9 +95,11 @@ def with_room_for_drifts(
     return replace(statistics, bands=read_only(bands), fault_bands=of_faults), read_only(raised)
 
 
-def drift_limits(statistics: Statistics, levels: FloatArray, drifts: SensorDrifts, columns: list[int]) -> FloatArray:
+def drift_limits(
+    statistics: Statistics, levels: FloatArray, drifts: SensorDrifts, columns: list[int], *, most: float = 1.0
+) -> FloatArray:
     """Return the least share ``(ny,)`` of the offset of each sensor that, without noise, passes a level of a statistic
-    for as long as it lasts; infinite where the whole offset passes none."""
+    for as long as it lasts; infinite where ``most`` of these offsets passes none."""
     white = np.median(drifts.white_means(statistics, columns), axis=1)
     rows = np.repeat(white[:, None], max(AGES), axis=1)
     faults = len(statistics.estimates) if drifts.away.size else 0
@@ -113,7 +115,7 @@ def drift_limits(statistics: Statistics, levels: FloatArray, drifts: SensorDrift
             values = np.maximum(values, (ratios / levels[count : count + faults]).max(axis=1))
         return np.asarray(values > 1.0)
 
-    low, high = np.zeros(len(white)), np.ones(len(white))
+    low, high = np.zeros(len(white)), np.full(len(white), most)
     whole = passed(high)
     while (high - low).max(initial=0.0) > LIMIT_SHARE:
         middle = (low + high) / 2.0
