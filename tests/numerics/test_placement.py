@@ -10,7 +10,7 @@ import pytest
 import scipy.linalg
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
-from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
+from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise, fastest_halving
 from obsynth.methods.engines.region import region_gain
 from obsynth.numerics.eigenstructure import jordan_form, place
 from obsynth.numerics.observable_part import observable_split
@@ -154,6 +154,32 @@ class TestKalman:
         easy = compromise(problem, 0.1)
         assert easy is not None
         assert easy[1] == 0.1
+
+    @pytest.mark.parametrize("like", [None, 1.0, 0.3, 1e-4])
+    @pytest.mark.parametrize("enough", range(17))
+    def test_many_states_take_few_halvings(self, enough: int, like: float | None) -> None:
+        """The fastest of 16 halvings that is cheap enough, or none, wherever the search begins; and the highest rate
+        is not solved by QZ where it is too noisy."""
+        tried: list[float] = []
+
+        def attempt(decay: float, *, only_doubled: bool = False) -> tuple[np.ndarray, float, float] | None:
+            tried.append(decay)
+            return (np.zeros((0, 0)), decay, 1.0) if decay <= 0.7 * 2.0**-enough and not only_doubled else None
+
+        found = fastest_halving(attempt, 0.7, 16, one_by_one=False, like=like)
+        reached = None if found is None else found[1]
+        assert reached == (None if enough == 16 else 0.7 * 2.0**-enough)
+        if like is None and enough < 16:
+            assert len(tried) <= 6
+        assert len(tried[1:]) == len({*tried[1:]})
+
+    def test_one_rate_that_is_cheap_enough_is_found(self) -> None:
+        def attempt(decay: float, **_: bool) -> tuple[np.ndarray, float, float] | None:
+            return (np.zeros((0, 0)), decay, 1.0) if decay == 0.125 else None
+
+        found = fastest_halving(attempt, 1.0, 16, one_by_one=False, like=None)
+        assert found is not None
+        assert found[1] == 0.125
 
     def test_correlated_noise(self) -> None:
         """Process noise that the measurement carries: the gain that removes it is part of the filter."""

@@ -5,8 +5,9 @@ The default needs no numbers: as fast as a fixed price in noise allows.  This co
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -122,8 +123,12 @@ class KalmanProblem:
             best, noise, high = gain, less, middle
         return best, noise
 
-    def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""
+    def solved(
+        self, decay: float, change: FloatArray, *, only_doubled: bool = False
+    ) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one.
+
+        ``only_doubled``: of many states, ``None`` rather than the time of the QZ algorithm."""
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.
@@ -133,16 +138,21 @@ class KalmanProblem:
         process = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
         process = 0.5 * (process + process.T)
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
+
+        def reached(gain: FloatArray) -> bool:
+            # Strictly: a rate that is only met within rounding is none.
+            return abscissa(self.F - (gain + direct) @ self.C, self.dt) < bound
+
         best: FloatArray | None = None
         for _ in range(KALMAN_ROUNDS):
-            filtered = _filtered(free, self.C, process, measured, (bound, self.dt), change)
+            filtered = _filtered(
+                free, self.C, process, measured, (bound, self.dt), change, reached=reached, only_doubled=only_doubled
+            )
             if filtered is None:
                 break
-            total = filtered[0] + direct
-            # Strictly: a rate that is only met within rounding is none.
-            if abscissa(self.F - total @ self.C, self.dt) < bound:
-                best = total
-            change = filtered[1]
+            gain, change, fast_enough = filtered
+            if fast_enough:
+                best = gain + direct
         return best, change
 
     def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
@@ -165,8 +175,12 @@ def _filtered(
     measured: FloatArray,
     rate_bound: tuple[float, float],
     change: FloatArray,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the gain of a Kalman filter, and states in which its error covariance is the identity."""
+    *,
+    reached: Callable[[FloatArray], bool],
+    only_doubled: bool,
+) -> tuple[FloatArray, FloatArray, bool] | None:
+    """Return the gain of a Kalman filter, states in which its error covariance is the identity, and whether the gain
+    has reached the rate."""
     bound, dt = rate_bound
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # What a badly conditioned equation gives is judged by its poles.
@@ -175,18 +189,20 @@ def _filtered(
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
             moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
             noise = 0.5 * (noise + noise.T)
-            for doubled in (True, False) if len(f) >= DOUBLING_FROM else (False,):
+            ways = (False,) if len(f) < DOUBLING_FROM else (True,) if only_doubled else (True, False)
+            for doubled in ways:
                 gain, covariance = _solved(moved, c @ change, noise, measured, dt, doubled=doubled)
                 gain = change @ (bound * gain if dt > 0.0 else gain)
-                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                fast_enough = bool(np.all(np.isfinite(gain))) and reached(gain)
+                if fast_enough:
                     break
+            values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             return None
     if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
         return None
     floor = float(np.finfo(np.float64).eps) * values[-1]
-    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
+    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor)))), fast_enough
 
 
 def _solved(
@@ -205,9 +221,13 @@ def _solved(
     return np.asarray(np.linalg.solve(measured, c @ y).T), y
 
 
-def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, float] | None:
+def compromise(
+    problem: KalmanProblem, rate: float, *, like: float | None = None
+) -> tuple[FloatArray, float, float] | None:
     """Return the fastest gain ``(n, ny)``, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise; its decay
-    (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate."""
+    (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate.
+
+    ``like``: the share of the rate that the plant's gain has with other outputs, near which the search begins."""
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
     slow = rate * 2.0**-MOST_RATE_HALVINGS
@@ -223,10 +243,9 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
     # A deviation that depends on the coordinates it is computed in is rounding, too.
     again = problem.deviations(plain, start)
     counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
-    best = plain, 0.0, 1.0
 
-    def attempt(decay: float) -> tuple[FloatArray, float, float] | None:
-        gain, change = problem.solved(decay, start)
+    def attempt(decay: float, *, only_doubled: bool = False) -> tuple[FloatArray, float, float] | None:
+        gain, change = problem.solved(decay, start, only_doubled=only_doubled)
         if gain is None:
             return None
         ratios = problem.deviations(gain, change)[counted] / quietest[counted]
@@ -234,18 +253,15 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
         price = float(np.max(ratios, initial=1.0))
         return (gain, decay, price) if price <= NOISE_PRICE else None
 
-    high = rate
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
-    for _ in range(MOST_RATE_HALVINGS):
-        trial = attempt(high)
-        if trial is not None:
-            best = trial
-            break
-        high /= 2.0
-        if high <= slowest:
-            # The quietest filter is as fast as that by itself.
-            break
-    if best[1] in (0.0, rate):
+    # The quietest filter is as fast as what is left by itself.
+    count = 1
+    while count < MOST_RATE_HALVINGS and rate * 2.0**-count > slowest:
+        count += 1
+    best = fastest_halving(attempt, rate, count, one_by_one=len(problem.F) < DOUBLING_FROM, like=like)
+    if best is None:
+        return plain, 0.0, 1.0
+    if best[1] == rate:
         return best
     low, high = best[1], 2.0 * best[1]
     while high > RATE_STEP * low:
@@ -256,3 +272,42 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
         else:
             best, low = trial, middle
     return best
+
+
+def fastest_halving(
+    attempt: Callable[..., tuple[FloatArray, float, float] | None],
+    rate: float,
+    count: int,
+    *,
+    one_by_one: bool,
+    like: float | None,
+) -> tuple[FloatArray, float, float] | None:
+    """Return what the fastest of ``rate, rate / 2, ...`` that is cheap enough comes to; none of ``count`` may be.
+
+    Of many states the number of halvings is bisected, as noise grows with the rate: high rates, which nearly always
+    are too noisy, take longest, as doubling breaks down there."""
+    trials: dict[int, tuple[FloatArray, float, float] | None] = {}
+
+    def trial(halvings: int) -> tuple[FloatArray, float, float] | None:
+        if halvings not in trials:
+            trials[halvings] = attempt(rate * 2.0**-halvings)
+        return trials[halvings]
+
+    if not one_by_one:
+        best = attempt(rate, only_doubled=True)
+        # No fewer halvings than `low` are enough, and `high` are.
+        low, high = 0, 0 if best is not None else count
+        near = None if like is None else math.ceil(-math.log2(like))
+        while low < high:
+            middle = near if near is not None and low <= near < high else (low + high) // 2
+            further = trial(middle)
+            if further is None:
+                low = middle + 1
+            else:
+                best, high = further, middle
+            if near is not None:
+                near = middle + 1 if further is None else middle - 1
+        if best is not None:
+            return best
+    # An equation may be lost in rounding at a lower rate than one that is cheap enough.
+    return next((found for found in map(trial, range(count)) if found is not None), None)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,14 +54,23 @@ SLOW_DEFAULT = 1000.0
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5
 
-Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
-
 #: Shares of the drive that are tried for a decay that is stated, while each is quieter than the last: the default is of
 #: the size of all sensors' noise, and a noisy sensor more made the filter faster than asked, and noisier.
 DRIVES = (1.0, 1e-1, 1e-2, 1e-3)
 
 #: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0
+
+
+class Choice(NamedTuple):
+    """A gain, the poles that were asked for, what is claimed of it, records of solvers, and, of a default, its decay as
+    a share of the plant's own rate."""
+
+    gain: FloatArray
+    poles: Sequence[complex] | None
+    claims: Mapping[str, float]
+    runs: tuple[Mapping[str, Any], ...]
+    rate_share: float | None = None
 
 
 def notes(
@@ -138,7 +147,8 @@ def synthesise(
     if method.G is not None:
         _require_stable_fixed_modes(problem)
     progress("choosing the gains")
-    gain, placed_poles, claims, runs = tried[1] if tried else _chosen(method, problem, region, weights, plant.dt)
+    choice = tried[1] if tried else _chosen(method, problem, region, weights, plant.dt)
+    gain, placed_poles, claims, runs = choice[:4]
     if merged is not None and working.Bw.any() and "noise_price" in claims:
         picked = [working.output_names.index(name) for name in designed.output_names]
         single = designed.replace(Dw=working.Dw[picked])
@@ -187,7 +197,9 @@ def _without_likeness(
     near = nearly_merged_outputs(known.plant)
     if near is None:
         return merged, None
-    own, other = (_compared(known, model, method, choice, weights) for choice in (merged, near))
+    own = _compared(known, model, method, merged, weights)
+    like = None if own is None else own.result[1].rate_share
+    other = _compared(known, model, method, near, weights, like=like)
     if other is None:
         return merged, own and own.result
     if own is None:
@@ -245,11 +257,14 @@ def _compared(
     weights: Mapping[str, Any],
     *,
     chosen: tuple[PlacementProblem, Choice] | None = None,
+    like: float | None = None,
 ) -> _Compared | None:
     """Return what a choice of outputs comes to, for a gain that is ``chosen`` or looked for; ``None`` where it has no
-    gain."""
+    gain.
+
+    ``like``: the share of the plant's rate that the default has with other outputs."""
     try:
-        problem, choice = chosen or _problem_and_choice(known, model, method, merged, weights)
+        problem, choice = chosen or _problem_and_choice(known, model, method, merged, weights, like=like)
     except (ObsynthError, np.linalg.LinAlgError):
         return None
     U, D, K = problem.gains(choice[0])
@@ -266,11 +281,17 @@ def _compared(
 
 
 def _problem_and_choice(
-    known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+    known: Existence,
+    model: Exosystem,
+    method: UiPiObserver,
+    merged: MergedOutputs | None,
+    weights: Mapping[str, Any],
+    *,
+    like: float | None,
 ) -> tuple[PlacementProblem, Choice]:
     plant = known.plant if merged is None else merged.plant
     problem = placement_problem(plant, model, known.fixed_modes, joint=method.joint, paper_matrices=None)
-    return problem, _chosen(method, problem, None, weights, known.plant.dt)
+    return problem, _chosen(method, problem, None, weights, known.plant.dt, like=like)
 
 
 def _placed(
@@ -296,11 +317,17 @@ def _placed(
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
         noise=placed_noise,
     )
-    return gain / outputs, poles, {"condition": condition}, ()
+    return Choice(gain / outputs, poles, {"condition": condition}, ())
 
 
 def _chosen(
-    method: UiPiObserver, problem: PlacementProblem, region: NamedRegion | None, weights: Mapping[str, Any], dt: float
+    method: UiPiObserver,
+    problem: PlacementProblem,
+    region: NamedRegion | None,
+    weights: Mapping[str, Any],
+    dt: float,
+    *,
+    like: float | None = None,
 ) -> Choice:
     """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
     split, time = problem.split, problem.units.time
@@ -310,6 +337,7 @@ def _chosen(
         return _placed(problem, poles, method.objective, kalman_problem(problem, weights) if spends else None)
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
+    share: float | None = None
     runs: tuple[Mapping[str, Any], ...] = ()
     if region is not None:
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, method)
@@ -319,11 +347,11 @@ def _chosen(
         own = method.decay > 0.0 and weights.keys().isdisjoint(("process", "fault"))
         drives = DRIVES if own else DRIVES[:1]
         gain = _for_decay(problem, kalman, method.decay, method.objective, dt, drives=drives)
-    elif (fair := compromise(kalman, problem.rate)) is not None:
-        gain, claims = fair[0], {"noise_price": fair[2]}
+    elif (fair := compromise(kalman, problem.rate, like=like)) is not None:
+        gain, claims, share = fair[0], {"noise_price": fair[2]}, fair[1] / problem.rate or None
     else:
         gain = _for_decay(problem, kalman, problem.rate / time, method.objective, dt)
-    return gain, None, claims, runs
+    return Choice(gain, None, claims, runs, share)
 
 
 def _as_fast_as(
