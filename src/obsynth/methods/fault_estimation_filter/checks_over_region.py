@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 from obsynth.analysis.existence.over_region import FilterOverRegion, examine_over_region
 from obsynth.errors import PreconditionError
@@ -105,9 +106,7 @@ def _fault_rows(
                 "(T A - L C) T Bf = 0 at every vertex, and Bf keeps its directions: at every point, for every course "
                 "of the parameters, a fault has no effect on the error after a sample"
             )
-            yield Check(
-                DECOUPLING_ROW, claim, row.value, row.bound, row.margin, row.passed, row.source, row.kind, row.detail
-            )
+            yield replace(row, name=DECOUPLING_ROW, claim=claim)
         else:
             yield row
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -205,10 +206,7 @@ def _index_row(vertices: Proved, witness: Witness | None, algebraic: tuple[str, 
         [] if holds else ["not proved" if proof is None else proof.reason],
         source="algebraic block of the same inequality, proved in balls",
     )
-    return Check(
-        row.name, row.claim, row.value, row.bound, row.margin, row.passed, row.source, "proved" if holds else row.kind,
-        row.detail,
-    )  # fmt: skip
+    return replace(row, kind="proved") if holds else row
 
 
 def _frozen_deviation(vertex: Vertex, differential: int) -> float:

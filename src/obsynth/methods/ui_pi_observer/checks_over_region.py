@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -103,10 +104,7 @@ def _identity_rows(
         place = misses.index(worst(misses))
         miss, claim, source = entries[place]
         row = equality(name, f"{claim}, at every vertex", miss, source, bound=EQUALITY_TOLERANCE)
-        yield Check(
-            row.name, row.claim, row.value, row.bound, row.margin, row.passed, row.source, row.kind,
-            f"{row.detail}, at {plant.scheduling.vertex_name(place)}",
-        )  # fmt: skip
+        yield replace(row, detail=f"{row.detail}, at {plant.scheduling.vertex_name(place)}")
 
 
 def _gain_rows(
