@@ -792,10 +792,11 @@ class Region:
         self.witness, self.proved_contraction = file.get("contraction"), None
         self.words = f", for every course of the weights of the {self.count} vertices, jumps among them"
 
-    def contraction(self):
-        """Return the contraction of the file, proved once."""
+    def contraction(self, slow):
+        """Return the contraction of the file, proved once: for slow courses of the weights, or for all."""
+        require(self.witness is not None, "the file has no contraction")
+        require(("step" in self.witness) == slow, "the contraction of the file is for other courses")
         if self.proved_contraction is None:
-            require(self.witness is not None, "the file has no contraction")
             self.proved_contraction = RegionContraction(self, self.witness)
         return self.proved_contraction
 
@@ -833,6 +834,182 @@ class Region:
         return matrices
 
 
+def between(one, two, weight):
+    """Return the mean of two matrices, the second with a weight (a matrix of one entry)."""
+    return one + (two - one).times(weight)
+
+
+class SlowCourses:
+    """Of two vertices of a sampled plant: what holds while the weight w of the second changes by at most a step.
+
+    The pairs of w now and at the next sample, ``0 <= w, w+ <= 1``, ``|w+ - w| <= step``, are a polygon of six corners.
+    ``V = e' P(w) e`` with ``P(w) = (1 - w) P_1 + w P_2``; a matrix S, the slack, is the same for all weights.  Each
+    inequality below is linear in the pair, so that it holds for all pairs if it does at the corners.  It is of the form
+    ``[[X, (S'a)'], [S'a, S + S' - P(w+)]] > 0`` and gives ``X > a' P(w+) a``: from ``(S - P)' P^-1 (S - P) >= 0``
+    follows ``S' P^-1 S >= S + S' - P > 0``, so that S has an inverse, and with the Schur complement
+    ``X > a' S (S + S' - P)^-1 S' a >= a' S (S' P^-1 S)^-1 S' a = a' P a``.
+    """
+
+    def __init__(self, region, given):
+        require(region.discrete and region.count == 2, "slow courses are those of two vertices of a sampled plant")
+        self.region, self.step, self.slack = region, read_matrix(given["step"]), read_matrix(given["slack"])
+        order, none, one = region.first.Az.rows, Matrix.zero(1, 1), Matrix.identity(1)
+        require(0 < self.step.number() <= 1, "the step of the weight is not between 0 and 1")
+        require((self.slack.rows, self.slack.columns) == (order, order), "the slack does not fit")
+        self.matrices, far = region.lyapunov_matrices(given), one - self.step
+        require(len(self.matrices) == 2, "slow courses need a P for each vertex")
+        self.corners = [(none, none), (none, self.step), (far, one), (one, one), (one, far), (self.step, none)]
+        self.words = slow_words(self.step.number(), "from sample to sample")
+
+    def require_at_corners(self, witnesses, form, what):
+        """Prove that ``form(system parts at w, P(w), S + S' - P(w+))`` is positive definite at every corner."""
+        require(len(witnesses) == len(self.corners), f"{what}: there is not a witness for each corner")
+        for (now, then), witness in zip(self.corners, witnesses, strict=True):
+            p, after = (between(*self.matrices, weight) for weight in (now, then))
+            name = f"{what}, weight {shown(now.number())}, then {shown(then.number())}"
+            require_positive_definite(form(now, p, self.slack + self.slack.T - after), witness, name)
+
+    def moved(self, now):
+        """Return ``S' Az`` at a weight."""
+        return self.slack.T @ between(*(system.Az for system in self.region.systems), now)
+
+    def driven(self, signal, now):
+        """Return ``S' B`` of a signal at a weight, and D, which does not change."""
+        (b, d), (other, _) = (system.driven(signal) for system in self.region.systems)
+        return self.slack.T @ between(b, other, now), d
+
+    def lyapunov(self, claim, rate, c=None):
+        """Prove that ``rate^2 V(e) - V(e+) - |c e|^2`` is positive."""
+
+        def form(now, p, lower):
+            first = p.times(rate).times(rate)
+            first, moved = first if c is None else first - c.T @ c, self.moved(now)
+            return Matrix.blocks([[first, moved.T], [moved, lower]])
+
+        self.require_at_corners(claim["decreases"], form, "the Lyapunov inequality")
+
+    def bounded_real(self, claim, signal, rows):
+        """Prove that ``V(e) - V(e+) - |c e + d s|^2 + gamma^2 |s|^2`` is positive."""
+        gamma, c = read_matrix(claim["gamma"]), -self.region.first.Cz.part(rows)
+        require(gamma.number() > 0, "gamma is not positive")
+
+        def form(now, p, lower):
+            moved, (driven, d) = self.moved(now), self.driven(signal, now)
+            d = d.part(rows)
+            level = Matrix.identity(d.columns).times(gamma).times(gamma) - d.T @ d
+            across = -(c.T @ d)
+            return Matrix.blocks([[p - c.T @ c, across, moved.T], [across.T, level, driven.T], [moved, driven, lower]])
+
+        self.require_at_corners(claim["bounded_real"], form, "the bounded real inequality")
+
+    def largest_trace(self, traces):
+        """Return a bound of ``tr b' P(w+) b`` for the noise: the trace of W with ``[[W, (S'b)'], [S'b, ...]] > 0``."""
+        covers, bounds = [each["covers"] for each in traces], [read_matrix(each["W"]) for each in traces]
+        left = iter(bounds)
+
+        def form(now, p, lower):
+            driven, _ = self.driven("noise", now)
+            return Matrix.blocks([[next(left), driven.T], [driven, lower]])
+
+        self.require_at_corners(covers, form, "the bound of the noise")
+        return max(trace(bound) for bound in bounds)
+
+
+def slow_words(step, each):
+    """Return of which courses of the weights of two vertices something is claimed."""
+    return f", for every course of the weights of the 2 vertices, each of which changes by at most {shown(step)} {each}"
+
+
+class SlowFlow:
+    """Of two vertices of a plant in continuous time: what holds while the weight w of the second has ``|w'| <= rate``.
+
+    ``V = e' P(w) e`` where P is a polynomial of degree d, given by its coefficients P_k in Bernstein's form: the sum of
+    ``binomial(d, k) w^k (1 - w)^(d - k) P_k``.  The derivative of V has the term ``w' e' (dP/dw) e``, which is linear
+    in w': an inequality is proved for ``w' = rate`` and for ``w' = -rate``.  It is a polynomial of degree d + 1 in w.
+    On equal pieces of [0, 1] a polynomial is a mean of its coefficients there, with weights that are not negative:
+    if these are positive definite on each piece, so is the polynomial.
+    """
+
+    def __init__(self, region, given):
+        require(not region.discrete and region.count == 2, "a rate is one of two vertices in continuous time")
+        self.region, self.rate, order = region, read_matrix(given["rate_of_weight"]), region.first.Az.rows
+        self.pieces = read_count(given["pieces"], "the number of pieces", most=1024)
+        require(self.rate.number() > 0, "the rate of the weight is not positive")
+        require(self.pieces and self.pieces & (self.pieces - 1) == 0, "the number of pieces is no power of two")
+        self.P = [read_matrix(each) for each in given["P"]]
+        require(0 < len(self.P) <= 100 and all(p.rows == p.columns == order for p in self.P), "P does not fit")
+        self.require_on_pieces(self.P, given["P_positive"], "P")
+        self.words = slow_words(self.rate.number(), "in a unit of time")
+
+    def require_on_pieces(self, coefficients, witnesses, what):
+        """Prove that a polynomial with these coefficients is positive definite on [0, 1]."""
+        found = [each for piece in on_pieces(coefficients, self.pieces) for each in piece]
+        require(len(found) == len(witnesses), f"{what}: there is not a witness for each coefficient")
+        for place, (matrix, witness) in enumerate(zip(found, witnesses, strict=True)):
+            require_positive_definite(matrix, witness, f"{what}, coefficient {place + 1}")
+
+    def slopes(self):
+        """Return the coefficients of degree d of dP/dw, of which those of degree d - 1 are ``d (P_(j+1) - P_j)``."""
+        last = len(self.P) - 1
+        found = []
+        for k, p in enumerate(self.P):
+            slope = Matrix.zero(p.rows, p.rows)
+            if k > 0:
+                slope = slope + (p - self.P[k - 1]).times(whole(k))
+            if k < last:
+                slope = slope + (self.P[k + 1] - p).times(whole(last - k))
+            found.append(slope)
+        return found
+
+    def bounded_real(self, claim, signal, rows):
+        """Prove that ``gamma^2 |s|^2 - |c e + d s|^2 - dV/dt`` is positive, times d + 1.
+
+        Coefficient k of the product of P with what is linear in w is ``(d + 1 - k) P_k X_1 + k P_(k-1) X_2``, divided
+        by d + 1; so is that of dP/dw, and of what is constant.
+        """
+        gamma, degree, slopes = read_matrix(claim["gamma"]), len(self.P), self.slopes()
+
+        def at(vertex, k, sign):
+            system = self.region.systems[vertex]
+            b, d = system.driven(signal)
+            whole_form = bounded_real(
+                False, gamma, self.P[k], self.P[k], system.Az, b, -system.Cz.part(rows), d.part(rows)
+            )
+            moved = slopes[k].times(self.rate).times(whole(sign))
+            return whole_form - diagonal(moved, Matrix.zero(b.columns, b.columns))
+
+        require(len(claim["bounded_real"]) == 2, "there are not witnesses for both signs of the rate")
+        for sign, witnesses in zip((1, -1), claim["bounded_real"], strict=True):
+            coefficients = []
+            for k in range(degree + 1):
+                parts = [at(0, k, sign).times(whole(degree - k))] if k < degree else []
+                parts += [at(1, k - 1, sign).times(whole(k))] if k else []
+                coefficients.append(total(parts))
+            self.require_on_pieces(coefficients, witnesses, "the bounded real inequality")
+
+
+def whole(number):
+    """Return a whole number as a matrix of one entry."""
+    return Matrix(1, 1, [[number]])
+
+
+def on_pieces(coefficients, pieces):
+    """Return the coefficients in Bernstein's form on each of some equal pieces of [0, 1]: halving by de Casteljau.
+
+    Means of neighbours, means of these, and so on: the first of each row are the coefficients on the first half, the
+    last of each those on the second half, backwards.
+    """
+    if pieces == 1:
+        return [coefficients]
+    low, high, row = [], [], coefficients
+    while row:
+        low.append(row[0])
+        high.insert(0, row[-1])
+        sums_of_two = [row[k] + row[k + 1] for k in range(len(row) - 1)]
+        row = [Matrix(each.rows, each.columns, each.entries, each.exponent - 1) for each in sums_of_two]
+    return on_pieces(low, pieces // 2) + on_pieces(high, pieces // 2)
+
+
 class RegionContraction:
     """What columns k_i of inputs at the vertices do to a row: as ``Contraction``, with ``|e|^2 = e' P(w) e``.
 
@@ -844,7 +1021,13 @@ class RegionContraction:
         rate, one = read_matrix(witness["rate"]), Matrix.identity(region.first.Az.rows)
         value = rate.number()
         require(0 < value < 1 if region.discrete else value > 0, "the rate is none of decay")
-        self.matrices, g = region.lyapunov(witness, rate), read_matrix(witness["G"])
+        if "step" in witness:
+            courses = SlowCourses(region, witness)
+            courses.lyapunov(witness, rate)
+            self.matrices, self.words = courses.matrices, courses.words
+        else:
+            self.matrices, self.words = region.lyapunov(witness, rate), region.words
+        g = read_matrix(witness["G"])
         for p, covers in zip(self.matrices, witness["G_covers"], strict=True):
             require_positive_definite(Matrix.blocks([[p, one], [one, g]]), covers, "G")
         self.slowness, rows = (1 - value if region.discrete else value), region.first.Cz
@@ -871,33 +1054,44 @@ def identities_hold_over_region(region, claim):
     return sentences[0] + region.words
 
 
-def decays_over_region(region, claim):
+def decays_over_region(region, claim, slow=False):
     """Errors decay: a Lyapunov inequality with a rate below one or, in continuous time, not below zero."""
-    rate = read_matrix(claim["rate"])
+    rate, words = read_matrix(claim["rate"]), region.words
     value = rate.number()
     require(0 < value < 1 if region.discrete else value > 0, "the rate is none of decay")
-    region.lyapunov(claim, rate)
+    if slow:
+        courses = SlowCourses(region, claim)
+        courses.lyapunov(claim, rate)
+        words = courses.words
+    else:
+        region.lyapunov(claim, rate)
     factor = f"(1 - {shown(1 - value, down=True)})^k" if region.discrete else f"exp(-{shown(value, down=True)} t)"
-    return f"errors decay faster than {factor}, up to a constant factor{region.words}"
+    return f"errors decay faster than {factor}, up to a constant factor{words}"
 
 
-def gain_is_below_over_region(region, claim):
+def gain_is_below_over_region(region, claim, slow=False):
     """The l2 gain from a signal to the errors of some rows is below gamma: the bounded real lemma with V of P(w)."""
-    rows, gamma, matrices = region.first.rows_of_each(claim["rows"]), claim["gamma"], region.lyapunov_matrices(claim)
+    rows, gamma, words = region.first.rows_of_each(claim["rows"]), claim["gamma"], region.words
 
     def form(system, p, after):
         b, d = system.driven(claim["signal"])
         c, d = -system.Cz.part(rows), d.part(rows)
         return bounded_real(region.discrete, read_matrix(gamma), p, after, system.Az, b, c, d)
 
-    region.require_at_all_pairs(matrices, claim["bounded_real"], form, "the bounded real inequality")
+    if slow:
+        courses = SlowCourses(region, claim) if region.discrete else SlowFlow(region, claim)
+        courses.bounded_real(claim, claim["signal"], rows)
+        words = courses.words
+    else:
+        matrices = region.lyapunov_matrices(claim)
+        region.require_at_all_pairs(matrices, claim["bounded_real"], form, "the bounded real inequality")
     return (
         f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below "
-        f"{shown(read_matrix(gamma).number())}{region.words}"
+        f"{shown(read_matrix(gamma).number())}{words}"
     )
 
 
-def mean_square_is_below(region, claim):
+def mean_square_is_below(region, claim, slow=False):
     """Under white noise of unit variance the errors of some rows have together at most this root mean square.
 
     The mean of ``V(e+)`` is that of ``e' a' P(w+) a e``, and ``tr b' P(w+) b``, as e depends on earlier noise alone.
@@ -905,23 +1099,31 @@ def mean_square_is_below(region, claim):
     ``level^2 + V(e) - V(e+)``, and averaged over more and more samples at most ``level^2``.
     """
     require(region.discrete, "the claim is for sampled plants")
-    rows, matrices = region.first.rows_of_each(claim["rows"]), region.lyapunov_matrices(claim)
+    rows, words = region.first.rows_of_each(claim["rows"]), region.words
     c, level = region.first.Cz.part(rows), read_matrix(claim["level"]).number()
     require(level > 0, "the level is not positive")
 
     def form(system, p, after):
         return p - system.Az.T @ after @ system.Az - c.T @ c
 
-    region.require_at_all_pairs(matrices, claim["decreases"], form, "the inequality of the mean square")
-    for system in region.systems:
-        b, d = system.driven("noise")
-        direct = trace(d.part(rows).T @ d.part(rows))
-        for after in matrices:
-            require(trace(b.T @ after @ b) + direct <= level**2, "the mean square is not proved")
+    directs = [system.driven("noise")[1].part(rows) for system in region.systems]
+    direct = max(trace(d.T @ d) for d in directs)
+    if slow:
+        courses = SlowCourses(region, claim)
+        courses.lyapunov(claim, Matrix.identity(1), c)
+        require(courses.largest_trace(claim["traces"]) + direct <= level**2, "the mean square is not proved")
+        words = courses.words
+    else:
+        matrices = region.lyapunov_matrices(claim)
+        region.require_at_all_pairs(matrices, claim["decreases"], form, "the inequality of the mean square")
+        for system in region.systems:
+            b, _ = system.driven("noise")
+            for after in matrices:
+                require(trace(b.T @ after @ b) + direct <= level**2, "the mean square is not proved")
     return (
         f"the errors of the {' and '.join(claim['rows'])} rows, averaged over the samples in the long run, have "
         f"together a root mean square of at most {shown(level)} under white noise as modelled, which the parameters do "
-        f"not depend on{region.words}"
+        f"not depend on{words}"
     )
 
 
@@ -930,9 +1132,10 @@ def trace(matrix):
     return sum((matrix.fraction(i, i) for i in range(matrix.rows)), Fraction(0))
 
 
-def rounding_adds_little_over_region(region, claim):
+def rounding_adds_little_over_region(region, claim, slow=False):
     """What rounding of the stored numbers adds to each row, see ``rounding_adds_little``; J, L and W do not change."""
-    contraction, found, worst = region.contraction(), [system.identities() for system in region.systems], Fraction(0)
+    contraction, worst = region.contraction(slow), Fraction(0)
+    found = [system.identities() for system in region.systems]
     pairs = {"states": ("K", "J"), "inputs": ("U", "L")}
     pairs |= {"disturbances": ("V", "W")} if region.first.decoupled else {}
     require(set(claim["bounds"]) == set(pairs), "there are not bounds for each kind of signal")
@@ -943,10 +1146,10 @@ def rounding_adds_little_over_region(region, claim):
         if kind == "states":
             require_faults_are_seen(region.first, bounds)
     listed = "state, input or disturbance" if region.first.decoupled else "state or input"
-    return f"rounding adds at most {shown(worst)} to any row, per unit of any {listed}{region.words}"
+    return f"rounding adds at most {shown(worst)} to any row, per unit of any {listed}{contraction.words}"
 
 
-def faults_are_estimated_over_region(region, claim):
+def faults_are_estimated_over_region(region, claim, slow=False):
     """A fault of any course shows in its own estimate one sample later, and in no other row, but for rounding.
 
     A fault impulse leaves ``b_j`` in e, with weights of all j, and ``a_i b_j`` a sample later: row r responds with d at
@@ -967,12 +1170,13 @@ def faults_are_estimated_over_region(region, claim):
         b, d = one.driven("faults")
         own.append(d.absolute() + (system.Cz @ b + wanted).absolute())
         moved += [other.Az @ b for other in region.systems]
-    region.contraction().require_bounds(bounds, moved, own, "faults")
+    contraction = region.contraction(slow)
+    contraction.require_bounds(bounds, moved, own, "faults")
     for i in system.rows_of(["fault"]):
         require(bounds.fraction(i, system.index("faults", system.row_kinds[i][1])) <= LARGEST_SHARE, NOT_ITS_FAULT)
     return (
         f"each fault is estimated as it was a sample ago, and shows nowhere else, to {shown(max(entries_of(bounds)))} "
-        f"per unit of it{region.words}"
+        f"per unit of it{contraction.words}"
     )
 
 
@@ -984,6 +1188,11 @@ REGION_CLAIMS = {
     "gain over the region": gain_is_below_over_region,
     "mean square over the region": mean_square_is_below,
     "faults over the region": faults_are_estimated_over_region,
+    "decay for slow courses": lambda region, claim: decays_over_region(region, claim, slow=True),
+    "rounding for slow courses": lambda region, claim: rounding_adds_little_over_region(region, claim, slow=True),
+    "gain for slow courses": lambda region, claim: gain_is_below_over_region(region, claim, slow=True),
+    "mean square for slow courses": lambda region, claim: mean_square_is_below(region, claim, slow=True),
+    "faults for slow courses": lambda region, claim: faults_are_estimated_over_region(region, claim, slow=True),
 }
 
 
@@ -1393,6 +1602,7 @@ UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueErro
 REST_ON_IDENTITIES = (
     *("gain", "matching", "deviation", "faults", "fault models"),
     *("gain over the region", "mean square over the region", "faults over the region"),
+    *("gain for slow courses", "mean square for slow courses", "faults for slow courses"),
 )
 CLAIMS = {
     "plant": plant_follows,

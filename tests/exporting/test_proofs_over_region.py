@@ -26,7 +26,6 @@ FAULTY = {**MATRICES, "B": [["1 + 0.1 * v"], [0.2]], "Bf": [[1], [0]], "Bd": [[0
 NOISY = {**MATRICES, "Bw": [["0.1 + 0.05 * v", 0, 0, 0], [0, 0.1, 0, 0]], "Dw": [[0, 0, 0.1, 0], [0, 0, 0, 0.2]]}
 FLOWING = {"A": [["-1 + 0.9 * v", 0.1], [0, -0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]]}
 RANGE: dict[str, Any] = {"v": [-1.0, 1.0]}
-SLOW: dict[str, Any] = {"v": {"range": [-1.0, 1.0], "rate": 0.1}}
 COMMON = ["identities over the region", "decay over the region", "rounding over the region"]
 #: Plant, scheduling, method, and what its file claims.
 DESIGNS: dict[str, tuple[dict[str, Any], dict[str, Any], str, list[str]]] = {
@@ -38,7 +37,6 @@ DESIGNS: dict[str, tuple[dict[str, Any], dict[str, Any], str, list[str]]] = {
     ),
     "pi": ({**MATRICES, "Bf": [[1], [0]]}, RANGE, "ui-pi-observer", [*COMMON, "gain over the region"]),
     "continuous pi": (FLOWING, RANGE, "ui-pi-observer", [*COMMON, "gain over the region"]),
-    "slow pi": (FLOWING, SLOW, "ui-pi-observer", COMMON),
     "kalman": (NOISY, RANGE, "descriptor-kalman", [*COMMON, "mean square over the region"]),
 }  # fmt: skip
 WHOLE = ("filter", "pi", "continuous pi", "kalman")
@@ -91,18 +89,12 @@ def test_what_a_file_claims_is_proved_by_a_process_of_its_own(name: str, tmp_pat
     assert "2 vertices, jumps among them" in report.text
 
 
-def test_what_is_proved_for_slow_parameters_alone_is_not_covered() -> None:
-    (left,) = (text for text in file_of("slow pi")["not_covered"] if "l2 gain" in text)
-    assert "change slowly" in left
-
-
-def test_a_proof_that_fails_for_every_course_is_not_called_one_for_slow_parameters() -> None:
-    """Matrices of a certificate that prove nothing, of a plant whose parameter has no rate."""
+def test_a_proof_that_fails_is_left_out_by_its_name() -> None:
+    """Matrices of a certificate that prove nothing."""
     design = design_of("pi")
     matrices = {**design.certificate.matrices, "P_region": -design.certificate.matrices["P_region"]}
     left = proof_of(design.replace(certificate=replace(design.certificate, matrices=matrices)))["not_covered"]
     assert "decay over the region" in left
-    assert not any("slowly" in text for text in left)
 
 
 def test_a_file_of_a_region_is_written_and_checked_on_the_command_line(

@@ -1,8 +1,8 @@
 """Proof files of designs over a region: the claims at all vertices, with one Lyapunov matrix or one for each vertex.
 
 What is written here is what section 5 of ``checker/check_proof.py`` asks for.  Lyapunov matrices are those of the
-certificate; slack matrices beside them are not needed, as what they prove holds without them.  What they prove for
-parameters that change slowly only is not covered.
+certificate.  What they do not prove for every course, as parameters change slowly, is claimed for such courses
+(`obsynth.exporting.proof_for_slow_courses`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from obsynth.exporting.exact_error_system import (
     rows_of,
 )
 from obsynth.exporting.proof_claims import ProofClaims
+from obsynth.exporting.proof_for_slow_courses import SlowCourses, SlowFlow
 from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -44,15 +45,18 @@ from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES
 SCHEDULED_OF_PLANT, SCHEDULED_OF_OBSERVER = ("A", "B", "Bf", "Bd", "Bw"), ("Az", "Bu", "By")
 #: What the inverse of a mean of Lyapunov matrices is multiplied by, to be above the inverse of each.
 COVERING_FACTORS = (1.0, 2.0, 4.0, 16.0, 256.0, 65536.0)
+#: For which courses of the parameters something is claimed.
+EVERY_COURSE, SLOW_COURSES = "over the region", "for slow courses"
 #: What every file of a region leaves to `obsynth.verify`.
 ALWAYS_LEFT = (
-    "that the plant with its parameters is a mean of these vertices: `obsynth verify` forms them from the ranges",
+    "that the plant with its parameters is a mean of these vertices, and how fast its weights move: `obsynth verify` "
+    "forms them from the ranges and rates",
     "rows whose parameters are outside their ranges or missing",
 )
-#: Claims of the methods that the file may prove: name, Lyapunov matrix, signal and kind of rows.
+#: Claims of the methods that the file may prove: name, Lyapunov matrix and slack, signal and kind of rows.
 GAINS = {
-    "fault-estimation-filter": ("gamma", WITNESSES[0], "disturbances", "fault"),
-    "ui-pi-observer": ("region_gain", GAIN_WITNESSES[0], "fault model", "fault"),
+    "fault-estimation-filter": ("gamma", WITNESSES, "disturbances", "fault"),
+    "ui-pi-observer": ("region_gain", GAIN_WITNESSES, "fault model", "fault"),
 }
 
 
@@ -222,14 +226,14 @@ class RegionProof(ProofClaims):
 
     def _add_decay(self) -> None:
         matrices, decay = self._lyapunov_matrices(WITNESSES[0]), self.design.certificate.claims.get("region_decay", 0.0)
-        slowness = 1.0 - decay if self.discrete else decay
-        found = None
+        slow, slowness = self._slow_courses(WITNESSES), 1.0 - decay if self.discrete else decay
+        found: dict[str, Any] | None = None
         for share in (1.0, 1.0 - RATE_SHARE) if matrices is not None and slowness > 0.0 else ():
-            rate = 1.0 - share * slowness if self.discrete else share * slowness
-            found = found or self._decaying(matrices or [], rate)
-        name = "decay: it is proved for parameters that change slowly" if self._is_slow else "decay over the region"
-        self.add(name, None if found is None else {"claim": "decay over the region", **found})
-        contraction = None if matrices is None else self._contraction(matrices, slowness)
+            rate = self._rate(share, slowness)
+            found = found or self._named("decay", EVERY_COURSE, self._decaying(matrices or [], rate))
+            found = found or self._named("decay", SLOW_COURSES, None if slow is None else slow.decay(rate))
+        self.add("decay over the region", found)
+        contraction = None if matrices is None else self._contraction(matrices, slow, slowness)
         if contraction is None:
             self.not_covered.append("what rounding of stored numbers adds: no contraction was found")
             return
@@ -237,16 +241,25 @@ class RegionProof(ProofClaims):
         if self.design.method == "fault-estimation-filter" and self.observer.effectiveness_is_one:
             self.add("each fault's own estimate: rounding may hide it", self._faults(contraction))
 
-    @property
-    def _is_slow(self) -> bool:
-        """Whether the parameters have rates: what is proved with these need not hold for jumps."""
-        return any(rate is not None for rate in self.design.scheduled[0].scheduling.rates)
+    def _rate(self, share: float, slowness: float) -> float:
+        return 1.0 - share * slowness if self.discrete else share * slowness
 
-    def _contraction(self, matrices: Sequence[Dyadic], slowness: float) -> ExactContraction | None:
+    @staticmethod
+    def _named(claim: str, courses: str, proved: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Return what is proved with the name of its claim."""
+        return None if proved is None else {"claim": f"{claim} {courses}", **proved}
+
+    def _slow_courses(self, names: tuple[str, str]) -> SlowCourses | None:
+        """Return what the certificate has for slow courses of a sampled plant."""
+        return SlowCourses.of(self.systems, self.design.scheduled[0], self.design.certificate.matrices, names)
+
+    def _contraction(
+        self, matrices: Sequence[Dyadic], slow: SlowCourses | None, slowness: float
+    ) -> ExactContraction | None:
         """Return a contraction with the Lyapunov matrices of the decay, and write its data."""
         for share in CONTRACTION_SHARES if slowness > 0.0 else ():
-            rate = 1.0 - share * slowness if self.discrete else share * slowness
-            witness = self._decaying(matrices, rate)
+            rate = self._rate(share, slowness)
+            witness = self._decaying(matrices, rate) or (None if slow is None else slow.decay(rate))
             covering = None if witness is None else _above_inverses(matrices)
             if witness is None or covering is None:
                 continue
@@ -255,6 +268,10 @@ class RegionProof(ProofClaims):
             own = 1 - Fraction(rate) if self.discrete else Fraction(rate)
             return ExactContraction(self.systems[0].cz, matrices, G, own)
         return None
+
+    @property
+    def _courses_of_contraction(self) -> str:
+        return SLOW_COURSES if self.witness is not None and "step" in self.witness else EVERY_COURSE
 
     def _rounding(self, contraction: ExactContraction) -> dict[str, Any] | None:
         missed = [system.missed for system in self.systems]
@@ -270,7 +287,7 @@ class RegionProof(ProofClaims):
             if np.any((goal > 0.0) & (bounds["states"][rows, -len(model.Phi) :] > ESTIMATE_SHARE * goal)):
                 return None
         return {
-            "claim": "rounding over the region",
+            "claim": f"rounding {self._courses_of_contraction}",
             "bounds": {kind: matrix_data(bound) for kind, bound in bounds.items()},
         }
 
@@ -293,68 +310,76 @@ class RegionProof(ProofClaims):
         estimates = [bounds[i, names.index(name)] for i, (kind, name, _) in enumerate(rows) if kind == "fault"]
         if max(estimates) > ESTIMATE_SHARE:
             return None
-        return {"claim": "faults over the region", "bounds": matrix_data(bounds)}
+        return {"claim": f"faults {self._courses_of_contraction}", "bounds": matrix_data(bounds)}
 
     def _add_gain(self) -> None:
         claims, plant = self.design.certificate.claims, self.design.scheduled[0]
-        name, letter, signal, kind = GAINS.get(self.design.method, ("", "", "", ""))
+        name, letters, signal, kind = GAINS.get(self.design.method, ("", WITNESSES, "", ""))
         if name not in claims or not plant.nf or (signal == "disturbances" and not plant.nd):
             return
-        matrices, found = self._lyapunov_matrices(letter), None
         rows = [i for i, (own, _, _) in enumerate(rows_of(self.systems[0].observer)) if own == kind]
-        for room in NORM_ROOM if matrices is not None else ():
+        slow: SlowCourses | SlowFlow | None = self._slow_courses(letters)
+        if slow is None:
+            slow = SlowFlow.of(self.systems, plant, self.design.certificate.matrices, letters[0])
+        matrices = self._lyapunov_matrices(letters[0])
+        found: dict[str, Any] | None = None
+        for room in NORM_ROOM:
             gamma = claims[name] * room
-
-            def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic, gamma: float = gamma) -> Dyadic:
-                b, d = system.driven(signal)
-                return system.bounded_real_form(
-                    gamma, p, after, system.az, b, -system.cz.rows_at(rows), d.rows_at(rows)
-                )
-
-            witnesses, stated = self._at_all_pairs(matrices or [], form), self._of_matrices(matrices or [])
-            if witnesses is not None and stated is not None:
-                found = {
-                    "claim": "gain over the region",
-                    "signal": signal,
-                    "rows": [kind],
-                    "gamma": number_data(gamma),
-                    **stated,
-                    "bounded_real": witnesses,
-                }
+            if matrices is not None:
+                found = self._named("gain", EVERY_COURSE, self._gain(matrices, gamma, signal, rows))
+            if slow is not None:
+                found = found or self._named("gain", SLOW_COURSES, slow.gain(gamma, signal, rows))
+            if found is not None:
+                found |= {"signal": signal, "rows": [kind]}
                 break
-        slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
-        self.add(f"the l2 gain {claims[name]:.6g} from the {signal}{slow}", found)
+        self.add(f"the l2 gain {claims[name]:.6g} from the {signal}", found)
+
+    def _gain(
+        self, matrices: Sequence[Dyadic], gamma: float, signal: str, rows: Sequence[int]
+    ) -> dict[str, Any] | None:
+        def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic) -> Dyadic:
+            b, d = system.driven(signal)
+            return system.bounded_real_form(gamma, p, after, system.az, b, -system.cz.rows_at(rows), d.rows_at(rows))
+
+        witnesses, stated = self._at_all_pairs(matrices, form), self._of_matrices(matrices)
+        if witnesses is None or stated is None:
+            return None
+        return {"gamma": number_data(gamma), **stated, "bounded_real": witnesses}
 
     def _add_mean_square(self) -> None:
         claims, matrices = self.design.certificate.claims, self._lyapunov_matrices(GAIN_WITNESSES[0])
         if "region_deviation" not in claims:
             return
         rows = [i for i, (kind, _, _) in enumerate(rows_of(self.systems[0].observer)) if kind == "state"]
+        directs = [system.driven("noise")[1].rows_at(rows) for system in self.systems]
+        direct, found = max(_trace(d.T @ d) for d in directs), None
+        slow = self._slow_courses(GAIN_WITNESSES)
+        proofs = [] if matrices is None or not self.discrete else [(EVERY_COURSE, self._mean_square(matrices, rows))]
+        proofs += [] if slow is None else [(SLOW_COURSES, slow.mean_square(rows))]
+        for courses, proof in proofs:
+            if proof is None or found is not None:
+                continue
+            proved, bounds = proof
+            level = max(root_above(max(map(_trace, bounds)) + direct), claims["region_deviation"])
+            if level <= claims["region_deviation"] * NORM_ROOM[-1]:
+                found = self._named("mean square", courses, {"rows": ["state"], "level": number_data(level), **proved})
+        self.add("the mean square of the errors", found)
+
+    def _mean_square(
+        self, matrices: Sequence[Dyadic], rows: Sequence[int]
+    ) -> tuple[dict[str, Any], list[Dyadic]] | None:
+        """Return what proves a mean square for every course, and matrices one of which has the trace of what the noise
+        puts into the errors."""
         c = self.systems[0].cz.rows_at(rows)
 
         def form(system: ExactErrorSystem, p: Dyadic, after: Dyadic) -> Dyadic:
             return p - system.az.T @ after @ system.az - c.T @ c
 
-        witnesses = None if matrices is None or not self.discrete else self._at_all_pairs(matrices, form)
-        stated, found = self._of_matrices(matrices or []), None
-        if matrices and witnesses is not None and stated is not None:
-            largest = Fraction(0)
-            for system in self.systems:
-                b, d = system.driven("noise")
-                direct = d.rows_at(rows)
-                parts = [_trace(b.T @ after @ b) + _trace(direct.T @ direct) for after in matrices]
-                largest = max([largest, *parts])
-            level = max(root_above(largest), claims["region_deviation"])
-            if level <= claims["region_deviation"] * NORM_ROOM[-1]:
-                found = {
-                    "claim": "mean square over the region",
-                    "rows": ["state"],
-                    "level": number_data(level),
-                    **stated,
-                    "decreases": witnesses,
-                }
-        slow = ", which is proved for parameters that change slowly" if self._is_slow else ""
-        self.add(f"the mean square of the errors{slow}", found)
+        witnesses, stated = self._at_all_pairs(matrices, form), self._of_matrices(matrices)
+        if witnesses is None or stated is None:
+            return None
+        driven = [system.driven("noise")[0] for system in self.systems]
+        return {**stated, "decreases": witnesses}, [b.T @ after @ b for b in driven for after in matrices]
 
 
 def _above_inverses(matrices: Sequence[Dyadic]) -> tuple[Dyadic, list[dict[str, Any]]] | None:
