@@ -263,6 +263,15 @@ def test_a_column_that_is_missing_is_mapped_by_its_signal(words: list[str], told
     assert told in capsys.readouterr().err
 
 
+def test_too_many_arguments_by_position_are_told_by_their_names() -> None:
+    with pytest.raises(TypeError, match=r"^Step takes its arguments by name: start, end, size\.$"):
+        obsynth.Step(1.0, 10.0)  # type: ignore[misc]
+    with pytest.raises(
+        TypeError, match=r"^DescriptorSystem takes E, A, B, C by position and the others by name: D, Bf"
+    ):
+        obsynth.DescriptorSystem([[1.0]], [[0.5]], [[1.0]], [[1.0]], [[0.0]])  # type: ignore[misc]
+
+
 @pytest.mark.parametrize(
     ("wrong", "meant"), [("Ts", "'dt'"), ("fault_name", "'fault_names'"), ("F", "'Bf'"), ("zzz", "")]
 )

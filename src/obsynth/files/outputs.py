@@ -173,9 +173,12 @@ def working_folder() -> Iterator[Path]:
         ) from error
 
 
-def write_atomically(path: str | Path, content: str | bytes) -> Path:
-    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all."""
+def write_atomically(path: str | Path, content: str | bytes, *, kind: FileKind | None = None) -> Path:
+    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all; of a stated kind
+    under no name of another format."""
     target = check_output(path)
+    if kind is not None:
+        kind.check_name(target)
     with replacement_of(target) as (handle, _), os.fdopen(handle, "wb") as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
     return target

@@ -104,6 +104,16 @@ def keyword_names(function: Callable[..., Any]) -> frozenset[str] | None:
     return frozenset(each.name for each in stated if each.kind in named) - {"self"}
 
 
+def _arguments_by_name(constructor: Callable[..., Any]) -> tuple[list[str], list[str]] | None:
+    """Return the arguments that a constructor takes by position, the object first, and the others; ``None`` where it
+    takes any by position."""
+    stated = list(signature(constructor).parameters.values())
+    if any(each.kind is Parameter.VAR_POSITIONAL for each in stated):
+        return None
+    by_name = [each.name for each in stated if each.kind is Parameter.KEYWORD_ONLY]
+    return [each.name for each in stated if each.name not in by_name], by_name
+
+
 def require_keywords(
     given: Iterable[str], known: frozenset[str] | None, function: str, meant: Meant | None = None
 ) -> None:
@@ -122,11 +132,15 @@ def _there_are(names: Sequence[str]) -> str:
 def keywords_suggested(function: Callable[Given, Returned], meant: Meant | None = None) -> Callable[Given, Returned]:
     """Return a function, or constructor, that suggests names for keyword arguments which it does not have."""
     known, of_class = keyword_names(function), function.__name__ == "__init__"
+    arguments = _arguments_by_name(function) if of_class else None
 
     @wraps(function)
     def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
         if known is not None and not known.issuperset(kwargs):
             require_keywords(kwargs, known, type(args[0]).__name__ if of_class else function.__name__, meant)
+        if arguments is not None and arguments[1] and len(args) > len(arguments[0]):
+            first = f"{', '.join(arguments[0][1:])} by position and the others" if arguments[0][1:] else "its arguments"
+            raise TypeError(f"{type(args[0]).__name__} takes {first} by name: {', '.join(arguments[1])}.")
         return function(*args, **kwargs)
 
     return called

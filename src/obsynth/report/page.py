@@ -157,7 +157,7 @@ def html_report(
             parts += [f"<details><summary><h2>{heading}</h2></summary>", *lines, "</details>", "</section>"]
         else:
             parts += [f"<h2>{heading}</h2>", *lines, "</section>"]
-    return write_atomically(path, standing_page(escape(f"{verified.name}: {verified.method}"), parts))
+    return write_atomically(path, standing_page(escape(f"{verified.name}: {verified.method}"), parts), kind=PAGE)
 
 
 def _zooms(design: ObserverDesign, scenario: Scenario | None, run: DataRun | None) -> Iterator[str]:

@@ -156,7 +156,7 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 
 def save(design: Any, path: str | Path) -> Path:
     """Write ``design`` to ``path`` atomically and return the path."""
-    return write_atomically(path, gain_set_bytes(design))
+    return write_atomically(path, gain_set_bytes(design), kind=GAIN_SET)
 
 
 def place_of(spec: Path) -> str:

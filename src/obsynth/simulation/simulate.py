@@ -200,7 +200,7 @@ class Simulation:
             if (column := form.format(name)) in table:
                 table[column] = table[column] + operating_point[name]
         table_writer(text, table)(zip(*(column.tolist() for column in table.values()), strict=True))
-        return write_atomically(path, text.getvalue())
+        return write_atomically(path, text.getvalue(), kind=SIMULATED_SIGNALS)
 
 
 @overload

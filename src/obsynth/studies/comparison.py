@@ -19,7 +19,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed
 from obsynth.report.plots.panels import data_url, with_unit, written
-from obsynth.results.certificate_files import result_text
+from obsynth.results.certificate_files import RESULT_FILE, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
@@ -329,7 +329,7 @@ class Comparison:
             why = "no method exists" if not self.recommended else "the log is in no file"
             raise SpecError(f"There is nothing to certify: {why}.", path="methods")
         text = result_text(COMPARISON, self._designs(), self.asked, self.claims(), self.statement, self.log)
-        return write_atomically(path, text)
+        return write_atomically(path, text, kind=RESULT_FILE)
 
     def plot(self) -> Figure:
         """Return a figure: for each fault, each method's estimate of a unit step, and its estimate on the scenario.

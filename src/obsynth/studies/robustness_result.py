@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import freeze
 from obsynth.numerics.outward import lower_text
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.transformations.moving_disturbances import continuous_behind
-from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
+from obsynth.results.certificate_files import RESULT_FILE, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import ROBUSTNESS
@@ -164,9 +164,8 @@ class Robustness:
             raise SpecError("No constant has a tolerance: there is nothing to certify.", path="constants")
         design = self.design.replace(report=verify(self.design))
         require_verified(design)
-        return write_atomically(
-            path, result_text(ROBUSTNESS, {"design": self.design}, {}, self.claims(), self.statement)
-        )
+        text = result_text(ROBUSTNESS, {"design": self.design}, {}, self.claims(), self.statement)
+        return write_atomically(path, text, kind=RESULT_FILE)
 
     def facts(self) -> Iterator[tuple[str, str]]:
         """Yield label and text of what a report shows."""

@@ -19,7 +19,7 @@ from obsynth.numerics.arguments import arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.numerics.outward import upper_text
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
-from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
+from obsynth.results.certificate_files import RESULT_FILE, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import STUDY
@@ -166,7 +166,7 @@ class ToleranceStudy:
             raise SpecError("The study holds no design: there is nothing to certify.", path="design")
         require_verified(self.design.replace(report=verify(self.design)))
         text = result_text(STUDY, {"design": self.design}, self.asked, self.as_dict(), self.statement)
-        return write_atomically(path, text)
+        return write_atomically(path, text, kind=RESULT_FILE)
 
     def __repr__(self) -> str:
         return "\n".join([*text_table(self.rows(), left_aligned=2), self.conclusion])

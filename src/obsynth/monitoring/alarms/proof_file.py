@@ -100,7 +100,7 @@ class AlarmProof:
             The file cannot be written.
         """
         body = self.certificate if self.proved else {"proved": False, "row": self.row, "statement": self.statement}
-        return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, body))
+        return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, body), kind=CERTIFICATE)
 
     def __repr__(self) -> str:
         return self.statement

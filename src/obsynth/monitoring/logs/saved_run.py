@@ -30,7 +30,7 @@ _TIME_PARTS = frozenset({"last", "longest"})
 def save_state(path: Path, run: LogRun, digest: str) -> None:
     """Write what a run carries from row to row, atomically."""
     body = plain({"gains": digest, "state": run.as_dict()})
-    write_atomically(path, sealed(RUN_STATE_KIND, RUN_STATE_VERSION, body, under="run"))
+    write_atomically(path, sealed(RUN_STATE_KIND, RUN_STATE_VERSION, body, under="run"), kind=STATE)
 
 
 def resume_state(path: Path, run: LogRun, digest: str) -> None:

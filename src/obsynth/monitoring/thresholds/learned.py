@@ -371,7 +371,8 @@ class LearnedThresholds:
         SpecError
             The file cannot be written.
         """
-        return write_atomically(path, sealed(LEARNED_KIND, LEARNED_VERSION, plain(self.as_dict()), under="thresholds"))
+        text = sealed(LEARNED_KIND, LEARNED_VERSION, plain(self.as_dict()), under="thresholds")
+        return write_atomically(path, text, kind=LEARNED)
 
 
 def duration(seconds: float) -> str:
