@@ -124,7 +124,7 @@ _OTHER_NAMES = {
     **dict.fromkeys(("hinf", "hinf_filter", "h2_filter"), "optimal_filter"),
     **dict.fromkeys(("fault_detection", "residual_generator", "parity", "parity_space"), "detection_filter"),
     **dict.fromkeys(("ss", "dss", "StateSpace", "Plant", "System", "LTI"), "DescriptorSystem"),
-    **dict.fromkeys(("c2d", "sample", "sample_system"), "discretise"),
+    **dict.fromkeys(("c2d", "sample", "sample_system", "transform"), "discretise"),
     **dict.fromkeys(("lmi", "lmis"), "conditions"),
     **dict.fromkeys(("plot", "plots"), "plotting"),
     **dict.fromkeys(("load_gains", "load_design", "read"), "load"),
@@ -258,12 +258,9 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(_PUBLIC_HOMES[name]), name)
     if name in _PUBLIC_PACKAGES:
         return import_module(f"obsynth.{name}")
-    from obsynth.numerics.suggestions import suggestion
+    from obsynth.numerics.suggestions import not_in_module
 
-    close = suggestion(name, __all__) if not name.startswith("_") else ""
-    if name in _OTHER_NAMES:
-        close = f" Did you mean {_OTHER_NAMES[name]!r}?"
-    raise AttributeError(f"module 'obsynth' has no attribute {name!r}.{close}".removesuffix("."))
+    raise not_in_module(__name__, name, __all__, _OTHER_NAMES)
 
 
 def __dir__() -> list[str]:

@@ -44,10 +44,9 @@ __all__ = sorted(_PICTURE_HOMES)
 def __getattr__(name: str) -> Any:
     if name in _PICTURE_HOMES:
         return getattr(import_module(_PICTURE_HOMES[name]), name)
-    from obsynth.numerics.suggestions import suggestion
+    from obsynth.numerics.suggestions import not_in_module
 
-    close = suggestion(name, __all__) if not name.startswith("_") else ""
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}.{close}".removesuffix("."))
+    raise not_in_module(__name__, name, __all__, {})
 
 
 def __dir__() -> list[str]:

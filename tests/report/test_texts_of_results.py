@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import traceback
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -116,15 +117,25 @@ ELSEWHERE = {
     "obsynth.kalman": "Did you mean 'descriptor_kalman'",
     "obsynth.ss": "Did you mean 'DescriptorSystem'",
     "obsynth.lmi": "Did you mean 'conditions'",
+    "obsynth.transform": "Did you mean 'discretise'",
+    "conditions.filasova_theorem": r"Did you mean 'filasova_theorem[12]'",
 }
 
 
 @pytest.mark.parametrize("written", ELSEWHERE)
 def test_an_attribute_of_another_library_is_answered_with_ours(written: str) -> None:
     owner, name = written.split(".")
-    of = {"design": design(), "plant": PLANT, "obsynth": obsynth}[owner]
-    with pytest.raises(AttributeError, match=ELSEWHERE[written]):
+    of = {"design": design(), "plant": PLANT, "obsynth": obsynth, "conditions": obsynth.conditions}[owner]
+    with pytest.raises(AttributeError, match=ELSEWHERE[written]) as raised:
         getattr(of, name)
+    if of in (obsynth, obsynth.conditions):
+        assert "".join(traceback.format_exception_only(raised.value)).count("Did you mean") == 1
+
+
+def test_a_scenario_shows_what_is_stated() -> None:
+    scenario = obsynth.Scenario(horizon=10.0, faults={"pump": obsynth.Step(size=1.0, start=3.0)}, seed=4)
+    assert repr(scenario) == ("Scenario(horizon=10.0, faults={'pump': (Step(start=3.0, end=inf, size=1.0),)}, seed=4)")
+    assert repr(obsynth.Scenario(horizon=10.0, noise=0.0)) == "Scenario(horizon=10.0)"
 
 
 def test_what_a_message_points_to_exists() -> None:

@@ -91,7 +91,9 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from obsynth.numerics.suggestions import not_in_module
+
+    raise not_in_module(__name__, name, __all__, {})
 
 
 def __dir__() -> list[str]:

@@ -39,6 +39,16 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     return f" Did you mean {' or '.join(repr(shortened(other)) for other in close)}?" if close else ""
 
 
+def not_in_module(module: str, name: str, known: Iterable[str], elsewhere: Mapping[str, str]) -> AttributeError:
+    """Return Python's error for a name that a module lacks, with the one that may be meant; ``elsewhere``: of names
+    that other libraries use."""
+    near = "" if name.startswith("_") else suggestion(name, list(known))
+    near = f" Did you mean {elsewhere[name]!r}?" if name in elsewhere else near
+    text = f"module {module!r} has no attribute {name!r}"
+    # An owner is named, so that Python does not append what it takes to be meant.
+    return AttributeError(f"{text}.{near}" if near else text, name=name, obj=None)
+
+
 def no_attribute(owner: object, name: str, elsewhere: Mapping[str, str]) -> AttributeError:
     """Return Python's error for an attribute that an object lacks, with where it is or which one may be meant.
 

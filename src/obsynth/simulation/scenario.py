@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -91,7 +91,7 @@ def _name_meant(name: str, known: Iterable[str], given: Iterable[str]) -> str:
 
 
 @partial(fields_suggested, meant=_name_meant)
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
     """The inputs, faults, disturbances and noise of a simulation, by signal; several profiles of one signal add up.
 
@@ -174,6 +174,15 @@ class Scenario:
                 raise SpecError("observer_state must be a list of finite numbers.", path="observer_state")
             require_no_overflow(state, "observer_state", "observer_state")
             object.__setattr__(self, "observer_state", tuple(state.tolist()))
+
+    def __repr__(self) -> str:
+        """Return the arguments that are not the defaults: the others say nothing."""
+        stated = {}
+        for each in fields(self):
+            value, usual = getattr(self, each.name), each.default
+            if value != ({} if usual is MISSING else usual):
+                stated[each.name] = dict(value) if isinstance(value, Mapping) else value
+        return f"Scenario({', '.join(f'{name}={value!r}' for name, value in stated.items())})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
