@@ -114,6 +114,8 @@ ELSEWHERE = {
     "plant.c2d": r"write obsynth.discretise\(plant, sample_time\)",
     "plant.Ts": "write plant.dt",
     "plant.states": "write plant.state_names",
+    "sampled.dt": r"write transformation\.plant\.dt",
+    "sampled.descriptions": "Did you mean 'description'",
     "obsynth.kalman": "Did you mean 'descriptor_kalman'",
     "obsynth.ss": "Did you mean 'DescriptorSystem'",
     "obsynth.lmi": "Did you mean 'conditions'",
@@ -125,7 +127,8 @@ ELSEWHERE = {
 @pytest.mark.parametrize("written", ELSEWHERE)
 def test_an_attribute_of_another_library_is_answered_with_ours(written: str) -> None:
     owner, name = written.split(".")
-    of = {"design": design(), "plant": PLANT, "obsynth": obsynth, "conditions": obsynth.conditions}[owner]
+    of = {"design": design(), "plant": PLANT, "obsynth": obsynth, "conditions": obsynth.conditions}.get(owner)
+    of = obsynth.discretise(PLANT, 0.1) if owner == "sampled" else of
     with pytest.raises(AttributeError, match=ELSEWHERE[written]) as raised:
         getattr(of, name)
     if of in (obsynth, obsynth.conditions):

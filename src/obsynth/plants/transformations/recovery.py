@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.sparse_factor import SolutionBounds
+from obsynth.numerics.suggestions import no_attribute
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery_operator import RecoveryOperator
 from obsynth.plants.uncertainty import matrices_of
@@ -109,6 +110,11 @@ class Transformation:
 
     def __repr__(self) -> str:
         return f"<Transformation: {self.description or 'nothing changed'}; plant: {self.plant!r}>"
+
+    def __getattr__(self, name: str) -> Any:
+        made = self.__dict__.get("plant")
+        own = {} if name.startswith("_") or not hasattr(made, name) else {name: f"transformation.plant.{name}"}
+        raise no_attribute(self, name, own)
 
     def with_tolerances(self, kind: str, size: float = 0.0) -> Transformation:
         """Return the step with the tolerances of its source carried on to its plant."""
