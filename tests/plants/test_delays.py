@@ -402,3 +402,33 @@ def test_methods_take_plants_whose_delays_became_states(method, delays):
 def test_both_signs_of_micro_are_microseconds():
     texts = ("300 us", "300 \u00b5s", "300\u03bcs")
     assert [seconds_of(text, "delays.u1") for text in texts] == pytest.approx([3e-4] * 3)
+
+
+@pytest.mark.parametrize(
+    "delays", [{"reflux": ["1 s", "7 s"]}, {"reflux": {"top": 1.0, "bottom": 7.0}}, {("reflux", "top"): 1.0}]
+)
+def test_a_signal_has_one_delay(delays) -> None:
+    with pytest.raises(obsynth.SpecError, match="a signal has one delay, in seconds.*give it once for each delay"):
+        delayed(input_names=["reflux"], delays=delays)
+
+
+def test_paths_with_delays_of_their_own_as_inputs_of_the_same_values() -> None:
+    """The column of Wood and Berry, in minutes: its steps are those of its four transfer functions."""
+    gains, times = np.array([[12.8, -18.9], [6.6, -19.4]]), np.array([[16.7, 21.0], [10.9, 14.4]])
+    late = np.array([[1.0, 3.0], [7.0, 3.0]])
+    paths = [(1, 0), (0, 0), (0, 1), (1, 1)]  # of reflux 7 and 1 late, of steam twice 3 late
+    column = obsynth.DescriptorSystem(
+        A=np.diag([-1.0 / times[path] for path in paths]),
+        B=[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, 1.0]],
+        C=[[gains[path] / times[path] if path[0] == i else 0.0 for path in paths] for i in (0, 1)],
+        input_names=["reflux to bottom", "reflux to top", "steam"],
+        output_names=["top", "bottom"],
+        delays={"reflux to bottom": 7.0, "reflux to top": 1.0, "steam": 3.0},
+    )
+    sampled = obsynth.discretise(column, 1.0).plant
+    u = np.array([1.0, 1.0, 0.5])
+    x = np.zeros(sampled.nx)
+    for k in range(30):
+        risen = 1.0 - np.exp(-np.maximum(k - late, 0.0) / times)
+        np.testing.assert_allclose(sampled.C @ x, (gains * risen) @ [1.0, 0.5], rtol=1e-9, atol=1e-12)
+        x = np.linalg.solve(sampled.E, sampled.A @ x + sampled.B @ u)

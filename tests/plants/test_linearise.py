@@ -10,7 +10,16 @@ import pytest
 from dae_plants import DESIGNS, ROD, diode, exchanger, pendulum
 from ruamel.yaml import YAML
 
-from obsynth import DAEModel, PreconditionError, SpecError, linearise, load_spec
+from obsynth import (
+    DAEModel,
+    PreconditionError,
+    SpecError,
+    functional_filter,
+    linearise,
+    load_spec,
+    optimal_filter,
+    ui_pi_observer,
+)
 from obsynth.cli.main import main
 
 #: Published constants of the tanks, which their calibration replaces.
@@ -241,3 +250,19 @@ def test_white_noise_of_a_plant_that_is_not_linearised_becomes_variances_of_its_
     options = load_spec(path).options
     assert options["R"] == {"gauge": pytest.approx(1e-4)}
     assert options["Q"] == {"balance": pytest.approx(0.002**2 / 4.0)}
+
+
+def test_a_parameter_without_effect_at_the_point_is_named_where_its_fault_is_refused() -> None:
+    """The valve is shut: how much it lets through changes nothing there, and does so at another point."""
+    tank = DAEModel(
+        {"balance": "2.0 * der(level) = inflow - c * sqrt(level) - opening * k"}, {"seen": "level"},
+        states={"level": 1.0}, inputs={"inflow": 0.5, "opening": 0.0}, parameters={"c": 0.5, "k": 1.0},
+    )  # fmt: skip
+    shut = linearise(tank, given={"level": 4.0}, free=["inflow"], faults=["k"])
+    for design in (functional_filter, ui_pi_observer, optimal_filter):
+        with pytest.raises(PreconditionError, match="The columns of k in Bf and Df are zero: at this operating point"):
+            design(shut)
+    open_by_half = linearise(tank, given={"level": 4.0, "opening": 0.5}, free=["inflow"], faults=["k"])
+    assert functional_filter(open_by_half).report.passed
+    with pytest.raises(PreconditionError, match="The columns of k in Bf and Df are zero. "):
+        functional_filter(shut.replace(operating_point=None))

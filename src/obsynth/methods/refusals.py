@@ -101,13 +101,25 @@ def with_advice(
     else:
         text = _no_remedy(plant)
     return PreconditionError(
-        " ".join([str(error), *notes, text]),
+        " ".join([str(error), *notes, *_zero_columns(plant), text]),
         condition=error.condition,
         mode=error.mode,
         signals=error.signals,
         add=sets,
         unclear=error.unclear,
     )
+
+
+def _zero_columns(plant: DescriptorSystem) -> list[str]:
+    """Return one sentence on faults that enter no equation and no output, and where that comes from; none elsewhere."""
+    entries = np.vstack([plant.Bf, plant.Df])
+    names = [name for name, column in zip(plant.fault_names, entries.T, strict=True) if not column.any()]
+    if not names:
+        return []
+    columns = f"The columns of {', '.join(names)} in Bf and Df are zero"
+    if not plant.operating_point:
+        return [f"{columns}."]
+    return [f"{columns}: at this operating point small changes have no effect. That of another point may be different."]
 
 
 def _with_an_option_at_its_default(method: Method) -> Iterator[tuple[str, Method]]:
