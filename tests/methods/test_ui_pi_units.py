@@ -227,3 +227,31 @@ def test_a_default_is_as_fast_in_other_coordinates(rows: dict[str, object], turn
         for plant in (own, turned)
     ]
     assert decays[0] == pytest.approx(decays[1], rel=0.2)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_given_poles_are_placed_with_the_same_gains_in_any_units(dt: float) -> None:
+    """A search of hundreds of steps decides them: rounding must not send it elsewhere."""
+    rng = np.random.default_rng([5, 0])
+    a, c, fault = rng.standard_normal((4, 4)) - np.eye(4), rng.standard_normal((2, 4)), rng.standard_normal((4, 1))
+    a = scipy.linalg.expm(dt * a) if dt else a
+    rates = np.linspace(2.0, 4.0, 5)
+    poles = np.exp(-rates * dt) if dt else -rates
+    noise = np.diag([0.01, 1.0])
+    own = ui_pi_observer(DescriptorSystem(A=a, C=c, Bf=fault, Dw=noise, dt=dt), poles=list(poles)).observer
+    states, outputs = 10.0 ** rng.uniform(-3, 3, 4), 10.0 ** rng.uniform(-3, 3, 2)
+    time = 1.0 if dt else 60.0
+    other = ui_pi_observer(
+        DescriptorSystem(
+            A=time * a * states / states[:, None], C=outputs[:, None] * c * states, Bf=time * fault / states[:, None],
+            Dw=outputs[:, None] * noise, dt=dt,
+        ),
+        poles=list(poles if dt else time * poles),
+    ).observer  # fmt: skip
+    # From outputs to the fault, whatever the states of the observer are.
+    for s in (0.3 + 0.4j, 0.1j, 1.5):
+        (one, many) = (
+            o.Cz[4] @ np.linalg.solve(t * s * np.eye(len(o.Az)) - o.Az, o.By) + o.Dy[4]
+            for o, t in ((own, 1.0), (other, 1.0 if dt else time))
+        )
+        np.testing.assert_allclose(many * outputs, one, rtol=1e-5, atol=1e-7 * np.abs(one).max())

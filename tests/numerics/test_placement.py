@@ -12,7 +12,7 @@ import scipy.linalg
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise, fastest_halving
 from obsynth.methods.engines.region import region_gain
-from obsynth.numerics.eigenstructure import jordan_form, place
+from obsynth.numerics.eigenstructure import MOST_CONDITION, jordan_form, place
 from obsynth.numerics.observable_part import observable_split
 from obsynth.numerics.placed_noise import PlacedNoise
 from obsynth.numerics.regions import NamedRegion
@@ -326,3 +326,15 @@ def test_what_poles_leave_free_is_spent_on_noise(dt: float) -> None:
     after, before = (noise.value_and_slope(quiet + change * direction)[0] for change in (1e-6, -1e-6))
     slope = noise.value_and_slope(quiet)[1]
     assert np.sum(slope * direction) == pytest.approx((after - before) / 2e-6, rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_less_noise_costs_at_most_a_stated_share_of_the_condition(seed: int) -> None:
+    rng = np.random.default_rng([11, seed])
+    f, c, b, read = (rng.standard_normal(shape) for shape in ((6, 6), (2, 6), (6, 1), (1, 6)))
+    f, b, d = f - 2.0 * np.eye(6), np.hstack([1e-3 * b, np.zeros((6, 2))]), np.diag([1e-3, 1.0])
+    noise = PlacedNoise(f, c, b, np.hstack([np.zeros((2, 1)), d]), read, 0.0)
+    poles = -np.linspace(2.0, 4.0, 6)
+    (plain, best), (quiet, condition) = place(f, c, poles), place(f, c, poles, noise=noise)
+    assert condition <= 1.001 * MOST_CONDITION * best
+    assert noise.value_and_slope(quiet)[0] <= noise.value_and_slope(plain)[0]

@@ -32,6 +32,19 @@ FIRST_SEARCH_STEPS, FINALISTS = 40, 3
 #: Steps of the search for less noise, and how much a condition that is e times as large counts, in its logarithm.
 QUIETENING_STEPS, CONDITION_SHARE = 200, 0.05
 
+#: Less noise costs at most this factor of the condition of the best conditioned eigenvectors.
+MOST_CONDITION = 30.0
+
+#: Weights of what a condition exceeds that by, squared and in its logarithm, one after the other until it is kept.
+EXCESS_WEIGHTS = (1.0, 30.0, 1000.0)
+
+#: Binary digits of the numbers that are searched with, of each entry and of the largest: those of a plant in other
+#: units are the same, and so is what a search of many steps ends at.
+DIGITS, DIGITS_OF_LARGEST = 20, 30
+
+#: Entries are often powers of two, which rounding would count with those above or below by chance.
+OFF_THE_POWERS = 1e-3
+
 #: Seed of the starts: the same question gives the same gains.
 STARTS_SEED = 20240
 
@@ -86,22 +99,30 @@ def place(
     """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of the (generalised) eigenvectors;
     ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``.
 
-    ``noise``: of these gains one near the best of the objective is taken that makes less of it.
+    ``noise``: of these gains one near the best of the objective is taken that makes less of it; its eigenvectors have
+    at most `MOST_CONDITION` times the condition.
     """
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
         return np.zeros((0, outputs)), 1.0
     if outputs == 0:
         raise SolverError("No output is free of the unknown inputs: no gain moves these poles.")
-    target = jordan_form(poles)
+    target, scale = jordan_form(poles), np.eye(n) if weight is None else weight
+    searched_f, searched_c, searched_target = f, c, target
+    if noise is not None:
+        # Only the search is in few digits: the gain of what it finds is that of the pair as it is.
+        noise, searched_target = noise.rounded(_in_few_digits), _in_few_digits(target)
+        searched_f, searched_c = noise.F, noise.C
     rng = np.random.default_rng(STARTS_SEED)
-    size = max(largest_singular_value(f), SMALLEST)
+    size = max(largest_singular_value(searched_f), SMALLEST)
     distance = np.min(np.abs(np.linalg.eigvals(f)[:, None] - np.asarray(poles)[None, :]))
     first = np.zeros((n, outputs))
     if distance <= OVERLAP * size:
-        first = rng.standard_normal((n, outputs)) * size / max(largest_singular_value(c), SMALLEST)
-    scale = np.eye(n) if weight is None else weight
-    problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
+        first = rng.standard_normal((n, outputs)) * size / max(largest_singular_value(searched_c), SMALLEST)
+    exact, problem = (
+        _Sylvester.of((a - first @ b).T, b.T, values, first.T, objective, scale.T @ scale)
+        for a, b, values in ((f, c, target), (searched_f, searched_c, searched_target))
+    )
     best: tuple[float, FloatArray] | None = None
     starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE_PAIR else FEW_STARTS)]
     if objective == "gain":
@@ -120,10 +141,10 @@ def place(
     if best is None:
         raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
     if noise is not None and (quieter := problem.quieter(best[1], noise)) is not None:
-        x, gain = problem.solution(quieter)
+        x, gain = exact.solution(quieter)
         if spectrum_error(f - (first + gain.T) @ c, poles, dt) <= PLACEMENT_TOLERANCE:
             return first + gain.T, float(np.linalg.cond(x))
-    x, gain = problem.solution(best[1])
+    x, gain = exact.solution(best[1])
     k = first + gain.T
     error = spectrum_error(f - k @ c, poles, dt)
     if not error <= PLACEMENT_TOLERANCE:
@@ -199,10 +220,32 @@ class _Sylvester:
         return float(np.log(value)), np.asarray(gradient / value).ravel()
 
     def quieter(self, start: FloatArray, noise: PlacedNoise) -> FloatArray | None:
-        """Return a G near ``start`` whose gain makes less of the noise; ``None`` where none is found."""
+        """Return a G near ``start`` whose gain makes less of the noise, with eigenvectors that are not much worse;
+        ``None`` where none is found."""
+        g = self.normalised(start)
+        try:
+            x, gain = self.solution(start)
+            limit = MOST_CONDITION * float(np.linalg.cond(x))
+            loudest, _ = noise.value_and_slope((gain + self.shift).T)
+            for weight in EXCESS_WEIGHTS if 0.0 < loudest < np.inf else ():
+                evaluate = self._noise_and_condition(noise, loudest, np.log(limit**2), weight)
+                before, (after, found) = evaluate(g.ravel())[0], _minimised(evaluate, g, QUIETENING_STEPS)
+                if not after < before:
+                    return None
+                if np.linalg.cond(self.states(found)) <= limit:
+                    return found
+        except np.linalg.LinAlgError:
+            pass
+        return None
+
+    def _noise_and_condition(
+        self, noise: PlacedNoise, loudest: float, limit: float, weight: float
+    ) -> Callable[[FloatArray], tuple[float, FloatArray]]:
+        """Return the logarithm of the noise, relative to ``loudest``, with what a condition counts beside it, and its
+        slope, as a function of G; ``limit`` is of the logarithm of the condition's square."""
 
         def evaluate(flat: FloatArray) -> tuple[float, FloatArray]:
-            g = flat.reshape(start.shape)
+            g = flat.reshape(self.B.shape[1], -1)
             x = self.states(g)
             inverse = np.asarray(np.linalg.inv(x), dtype=np.float64)
             gain = g @ inverse
@@ -210,16 +253,14 @@ class _Sylvester:
             condition, of_condition = _conditioning(x, inverse)
             if not (value > 0.0 and np.isfinite(value)):
                 return np.inf, np.zeros(g.size)
-            weight = -gain.T @ slope.T @ inverse.T / value + CONDITION_SHARE * of_condition / condition
-            gradient = slope.T @ inverse.T / value + self.B.T @ self.adjoint(weight)
-            return float(np.log(value) + CONDITION_SHARE * np.log(condition)), np.asarray(gradient).ravel()
+            excess = max(float(np.log(condition)) - limit, 0.0)
+            share = CONDITION_SHARE + 2.0 * weight * excess
+            of_states = -gain.T @ slope.T @ inverse.T / value + share * of_condition / condition
+            gradient = slope.T @ inverse.T / value + self.B.T @ self.adjoint(of_states)
+            counted = CONDITION_SHARE * np.log(condition) + weight * excess**2
+            return float(np.log(value / loudest) + counted), np.asarray(gradient).ravel()
 
-        g = self.normalised(start)
-        try:
-            before, after = evaluate(g.ravel())[0], _minimised(evaluate, g, QUIETENING_STEPS)
-        except np.linalg.LinAlgError:
-            return None
-        return after[1] if after[0] < before else None
+        return evaluate
 
     def minimised(
         self, start: FloatArray, *, steps: int = MOST_PLACEMENT_STEPS, restarts: int = RESTARTS
@@ -258,6 +299,17 @@ def _minimised(evaluate: Callable[[FloatArray], Any], start: FloatArray, steps: 
     with np.errstate(all="ignore"):
         done = minimize(evaluate, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": steps})
     return float(done.fun), np.asarray(done.x).reshape(start.shape)
+
+
+def _in_few_digits(matrix: FloatArray) -> FloatArray:
+    """Return a matrix without the digits in which it may differ from one unit of the data to another."""
+    largest = float(np.max(np.abs(matrix), initial=0.0))
+    if largest == 0.0:
+        return matrix
+    sizes = np.where(matrix == 0.0, largest, np.abs(matrix))
+    exponents = np.floor(np.log2(sizes) + OFF_THE_POWERS) - DIGITS
+    steps = np.exp2(np.maximum(exponents, np.floor(np.log2(largest) + OFF_THE_POWERS) - DIGITS_OF_LARGEST))
+    return np.asarray(steps * np.round(matrix / steps))
 
 
 def _conditioning(x: FloatArray, inverse: FloatArray) -> tuple[float, FloatArray]:

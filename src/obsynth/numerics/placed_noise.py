@@ -7,11 +7,12 @@ With ``e+ = (F - K C) e + (B - K D) w`` (e' for dt = 0), w white, and estimates 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 
 
@@ -25,6 +26,19 @@ class PlacedNoise:
     D: FloatArray  # (ny, k)
     estimates: FloatArray  # (m, n)
     dt: float  # s, 0 for continuous time
+
+    def rounded(self, to_digits: Callable[[FloatArray], FloatArray]) -> PlacedNoise:
+        """Return the same with matrices of fewer digits, of noise and estimates near one."""
+        of_noise = max(float(np.linalg.norm(self.D)), float(np.linalg.norm(self.B)), SMALLEST)
+        of_estimates = max(float(np.linalg.norm(self.estimates)), SMALLEST)
+        return PlacedNoise(
+            F=to_digits(self.F),
+            C=to_digits(self.C),
+            B=to_digits(self.B / of_noise),
+            D=to_digits(self.D / of_noise),
+            estimates=to_digits(self.estimates / of_estimates),
+            dt=self.dt,
+        )
 
     def value_and_slope(self, gain: FloatArray) -> tuple[float, FloatArray]:
         """Return the mean square for a gain ``(n, ny)`` that makes the errors decay, and its slope in each entry."""

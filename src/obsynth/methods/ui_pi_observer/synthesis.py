@@ -297,11 +297,11 @@ def _problem_and_choice(
 def _placed(
     problem: PlacementProblem, poles: Sequence[complex], objective: str, noise: KalmanProblem | None = None
 ) -> Choice:
-    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed.
-
-    ``noise``: what these leave free is spent on."""
+    """Return the gain for given poles; where gains shall be small, that is in the user's units if outputs are not
+    mixed.  ``noise``: what these leave free is spent on; then no units of the user count."""
     split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.undisturbed, np.eye(plant.ny))
+    plain_outputs = plain_outputs and noise is None
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
     scaled_poles = [units.rate * pole for pole in poles]
     placed_noise = None
