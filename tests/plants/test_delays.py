@@ -408,7 +408,7 @@ def test_both_signs_of_micro_are_microseconds():
     "delays", [{"reflux": ["1 s", "7 s"]}, {"reflux": {"top": 1.0, "bottom": 7.0}}, {("reflux", "top"): 1.0}]
 )
 def test_a_signal_has_one_delay(delays) -> None:
-    with pytest.raises(obsynth.SpecError, match="a signal has one delay, in seconds.*give it once for each delay"):
+    with pytest.raises(obsynth.SpecError, match=r"a signal has one delay, in seconds.*give it once for each delay"):
         delayed(input_names=["reflux"], delays=delays)
 
 
