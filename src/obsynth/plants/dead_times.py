@@ -39,7 +39,7 @@ def checked_delays(entries: Any, inputs: Sequence[str], outputs: Sequence[str]) 
             raise SpecError(
                 f"delays names {name!r}, which is an input and an output: give them different names.", path="delays"
             )
-        if isinstance(name, tuple) or isinstance(value, (list, tuple, Mapping)) or getattr(value, "ndim", 0):
+        if isinstance(name, tuple) or isinstance(value, (list, tuple, Mapping)) or bool(getattr(value, "ndim", 0)):
             raise SpecError(
                 f"delays[{name!r}] is {shown(value)}: a signal has one delay, in seconds. Where an input reaches the "
                 "outputs by paths with delays of their own, give it once for each delay, as inputs with names of their "
