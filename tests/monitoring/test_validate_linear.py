@@ -117,3 +117,13 @@ def test_without_stated_noise_nothing_is_judged() -> None:
     log = {"time": np.arange(50.0), "y1": np.zeros(50), "y2": np.zeros(50)}
     with pytest.raises(SpecError, match="sensor_noise"):
         obsynth.validate(obsynth.fault_estimation_filter(plant), log)
+
+
+def test_innovations_are_computed_once_where_no_sample_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The start of the filter is as far off as the states have been, which needs no innovations."""
+    from obsynth.monitoring.calibration import validating
+
+    runs, run = [], validating.recorded_innovations
+    monkeypatch.setattr(validating, "recorded_innovations", lambda *given: runs.append(given[1]) or run(*given))
+    obsynth.validate(DESIGN, log_of(PLANT)[:60])
+    assert len(runs) == 1

@@ -114,7 +114,7 @@ def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedIn
             estimates, estimates.innovations, np.sqrt(np.einsum("kii->ki", estimates.innovation_covariances))
         )
     if isinstance(observer, RecursiveObserver):
-        return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
+        return _recursive(changed(observer, sensors=None), log, _operating_point(design))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
 
 
@@ -148,8 +148,7 @@ def _over(observer: DAEObserver, log: RecordedLog) -> Estimates:
 def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str, float]) -> RecordedInnovations:
     """Predict each sample from those before it: a step without measurements, beside the one with them."""
     plant = observer.plant
-    y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
-    u = log.measured_inputs - np.array([point.get(name, 0.0) for name in plant.input_names])
+    y, u = _deviating(observer, log, point)
     state, nothing = observer.init(), np.full(plant.ny, np.nan)
     e, deviations, rows = np.full(y.shape, np.nan), np.full(y.shape, np.nan), []
     for k in range(len(y)):
@@ -160,6 +159,19 @@ def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str
         state, row = observer.advance(state, y[k], u[k])
         rows.append(row)
     return _recorded(recursive_estimates(observer, rows), e, deviations)
+
+
+def _deviating(
+    observer: RecursiveObserver, log: RecordedLog, point: Mapping[str, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs and inputs of a log as they deviate from the operating point."""
+    y = log.y - np.array([point.get(name, 0.0) for name in observer.plant.output_names])
+    u = log.measured_inputs - np.array([point.get(name, 0.0) for name in observer.plant.input_names])
+    return y, u
+
+
+def _operating_point(design: ObserverDesign) -> dict[str, float]:
+    return dict(getattr(design.plant, "operating_point", {}))
 
 
 def _recorded(run: Estimates, innovations: FloatArray, deviations: FloatArray) -> RecordedInnovations:
@@ -320,9 +332,10 @@ def validate(
     stated, linear = design, is_linear(design)
     record_log = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
     note(f"innovations of {record_log.samples} rows")
+    whole_walk = None
     if linear:
-        design, record_log = _of_linear_plant(design, record_log)
-    whole_walk = recorded_innovations(design, record_log)
+        design, record_log, whole_walk = _of_linear_plant(design, record_log)
+    whole_walk = whole_walk or recorded_innovations(design, record_log)
     design, record, walk_notes = _as_far_as_it_walks(design, record_log, whole_walk, note)
     far_off, near = _far(whole_walk.estimates, design, record_log.samples)
     sensors = _sensors(record, design.plant.output_names)
@@ -407,10 +420,28 @@ def _usable_log(
     return record.shifted(design.input_delay).without(wrong_samples(record.y))
 
 
-def _of_linear_plant(design: ObserverDesign, log: RecordedLog) -> tuple[ObserverDesign, RecordedLog]:
-    """Return the Kalman filter of the plant of a linear design, and the log without samples that it excludes."""
-    made = filter_of_linear_plant(design, log, lambda tried: recorded_innovations(tried, log).states)
-    return made, log.without(standing_out(recorded_innovations(made, log).standardised))
+def _of_linear_plant(
+    design: ObserverDesign, log: RecordedLog
+) -> tuple[ObserverDesign, RecordedLog, RecordedInnovations | None]:
+    """Return the Kalman filter of the plant of a linear design, the log without samples that it excludes, and its run
+    over the log where it excludes none."""
+    made = filter_of_linear_plant(design, log, lambda tried: _states(tried, log))
+    run = recorded_innovations(made, log)
+    wrong = standing_out(run.standardised)
+    return (made, log.without(wrong), None) if wrong.any() else (made, log, run)
+
+
+def _states(design: ObserverDesign, log: RecordedLog) -> FloatArray:
+    """Return the estimates of the states ``(n, nx)`` along a log."""
+    observer = design.observer
+    if not isinstance(observer, RecursiveObserver):
+        raise TypeError(f"{type(observer).__name__} is no recursion")
+    state, rows = observer.init(), []
+    # Inputs may be missing, which `run` does not take.
+    for y_k, u_k in zip(*_deviating(observer, log, _operating_point(design)), strict=True):
+        state, row = observer.advance(state, y_k, u_k)
+        rows.append(row)
+    return recursive_estimates(observer, rows).states
 
 
 def _contradicted(
