@@ -273,6 +273,15 @@ def test_too_many_arguments_by_position_are_told_by_their_names() -> None:
 
 
 @pytest.mark.parametrize(
+    ("option", "meant"), [("P0", "initial_covariance"), ("x0", "initial_state"), ("RN", "R"), ("process_noise", "Q")]
+)
+def test_an_option_by_the_name_of_another_library_is_asked_about(option: str, meant: str) -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match=rf"has no option '{option}'\. Did you mean '{meant}'\?"):
+        obsynth.descriptor_kalman(plant, **{option: 1.0})
+
+
+@pytest.mark.parametrize(
     ("wrong", "meant"), [("Ts", "'dt'"), ("fault_name", "'fault_names'"), ("F", "'Bf'"), ("zzz", "")]
 )
 def test_an_argument_by_another_name_is_asked_about(wrong: str, meant: str) -> None:

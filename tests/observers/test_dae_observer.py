@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import re
 from functools import cache
 
 import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
+import obsynth
 from obsynth import (
     DAEModel,
     DAEObserver,
@@ -442,3 +444,21 @@ def test_where_most_starts_are_no_states_it_says_so() -> None:
     """Known to 50 m around 1 m: 98 % of the starts are below the bottom or above the brim."""
     with pytest.raises(VerificationError, match=r"realisation fails: runs: No solution at k = 1: .*'balance'"):
         tank_with_overflow(50.0)
+
+
+@pytest.mark.long
+def test_a_reactor_that_may_run_away_is_designed() -> None:
+    """It was refused: from some starts within the default deviations an exothermic reactor ignites, and the equations
+    of a step have no solution then, in however few steps."""
+    reactor = DAEModel(
+        {
+            "mass": "V * der(c) = q * (1 - c) - V * k0 * exp(-EoR / T) * c",
+            "heat": "V * rho * cp * der(T) = q * rho * cp * (350 - T) + dH * V * k0 * exp(-EoR / T) * c "
+            "+ UA * (Tc - T)",
+        },
+        {"T": "T"}, states={"c": 0.5, "T": 350.0}, inputs={"Tc": 300.0},
+        constants={"V": 100, "q": 100, "k0": 7.2e10, "EoR": 8750, "rho": 1000, "cp": 0.239, "dH": 5e4, "UA": 5e4},
+    )  # fmt: skip
+    made = obsynth.extended_kalman(reactor, dt=0.05, Q={"mass": 1e-6, "heat": 1.0}, R={"T": 0.01})
+    (row,) = [check for check in made.report.checks if check.name == "NEES"]
+    assert re.search(r"starts that have no solution over [23] steps were drawn again: \d+", row.detail)

@@ -45,6 +45,17 @@ Purpose: TypeAlias = Literal[
 #: Gains from fast errors of a measurement to a fault estimate above this are worth a note.
 WARN_AMPLIFICATION = 50.0
 
+#: Options by the names that other libraries have for them; the first that a method has is meant.
+_OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("P0", "P", "initial_deviation"), ("initial_covariance",)),
+    **dict.fromkeys(("x0", "z0"), ("initial_state",)),
+    **dict.fromkeys(("Ts", "h", "sampling_time"), ("dt", "sample_time")),
+    **dict.fromkeys(("QN", "W", "process_noise"), ("Q",)),
+    **dict.fromkeys(("RN", "V", "measurement_noise"), ("R",)),
+    **dict.fromkeys(("rate", "alpha", "convergence_rate"), ("decay",)),
+    **dict.fromkeys(("hinf", "level", "gain"), ("gamma",)),
+}
+
 
 @dataclass(frozen=True)
 class ClaimMeaning:
@@ -135,7 +146,7 @@ class Method(ABC):
         unknown = sorted(set(options) - set(field_types(cls)))
         if unknown:
             known = sorted(field_types(cls))
-            near = suggestion(unknown[0], known) if len(unknown) == 1 else ""
+            near = _near(unknown[0], known) if len(unknown) == 1 else ""
             raise SpecError(
                 f"{cls.id} has no option {', '.join(map(repr, unknown))}.{near} There are: {', '.join(known)}.",
                 path=OPTIONS_PATH,
@@ -224,6 +235,12 @@ class Method(ABC):
     def as_plain(self) -> dict[str, Any]:
         """Return every option by name, as lists, mappings, numbers and texts."""
         return {name: plain(value) for name, value in self.as_given().items()}
+
+
+def _near(unknown: str, known: list[str]) -> str:
+    """Return the end of a message on an option that is not known: which one may be meant."""
+    ours = next((name for name in _OTHER_NAMES.get(unknown, ()) if name in known), None)
+    return suggestion(unknown, known) if ours is None else f" Did you mean {ours!r}?"
 
 
 def plain(value: Any) -> Any:

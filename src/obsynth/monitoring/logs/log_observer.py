@@ -103,6 +103,10 @@ class LogObserver(ABC):
         slack = SETTLING_SLACK * self.dt if self.dt > 0.0 else SETTLING_ULPS * math.ulp(abs(time) + seconds)
         return time + seconds - slack
 
+    def warnings(self) -> tuple[str, ...]:
+        """Return what a run should say of the observer once it has ended."""
+        return ()
+
     @property
     def takes_pieces(self) -> bool:
         """Whether `take_piece` can go on from where the observer is."""

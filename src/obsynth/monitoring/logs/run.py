@@ -361,6 +361,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
         outliers=dict(getattr(run.observer, "outliers", {})),
         warnings=(
             *run.observer.notes,
+            *run.observer.warnings(),
             *stamps.warnings(),
             *run.first.warnings(),
             *stamps.measured.notes(run.signals.columns_and_signals(), run.signals.inputs),

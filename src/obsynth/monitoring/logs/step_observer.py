@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError, counted
 from obsynth.monitoring.logs.log_observer import GAP, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.monitoring.thresholds.watched_columns import innovation_names
@@ -24,7 +24,10 @@ class SteppingLogObserver(LogObserver):
     By default no warm-up, as covariances of the start say how uncertain the estimates are, and a gate for outliers
     where the observer says nothing of them."""
 
-    saved: ClassVar = {"observer": "state", "u": "u", "spread": "spread", "usual": "usual"}
+    saved: ClassVar = {
+        **{"observer": "state", "u": "u", "spread": "spread", "usual": "usual"},
+        **{"left_out": "left_out", "restarts": "restarts", "first_restart": "first_restart"},
+    }
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer
@@ -65,6 +68,9 @@ class SteppingLogObserver(LogObserver):
         self.u: FloatArray | None = None
         # Deviations of the faults at the last row, and before samples were missing: zero where nothing is left of that.
         self.spread = self.usual = np.zeros(len(self.fault_names))
+        # Outliers before the observer last started, how often it did as the model had no solution, and first when.
+        self.left_out = np.zeros(len(self.output_names))
+        self.restarts, self.first_restart = 0, 0.0
 
     def follows(self, missing: int) -> bool:
         """Whether rows that are missing are taken one by one: always where the plant changes with k."""
@@ -72,6 +78,7 @@ class SteppingLogObserver(LogObserver):
 
     def _begin(self) -> None:
         """Start the observer again."""
+        self.left_out = self.left_out + self.state.refused[1]
         self.state = self.observer.init()
         if self.chain is not None:
             self.chain = SmootherHistory(self.chain.links)
@@ -83,9 +90,20 @@ class SteppingLogObserver(LogObserver):
 
     @property
     def outliers(self) -> dict[str, int]:
-        """How many samples of each output were outliers, since the observer last started."""
-        counts = self.state.refused[1]
+        """How many samples of each output were outliers."""
+        counts = self.left_out + self.state.refused[1]
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a text where the observer started again as its model had no solution."""
+        if not self.restarts:
+            return ()
+        return (
+            f"In {counted(self.restarts, 'row')} (the first at {self.first_restart:.6g} s) the model had no solution "
+            "from the estimates before, and the observer started again: estimates there are those of the start, with "
+            "its deviations. Either the model does not hold for these rows, or its steps are too long for them "
+            "(integration, dt).",
+        )
 
     def _begun(self, u: FloatArray) -> FloatArray:
         """Return inputs ``(nu,)`` with those of the row before where they are missing: an observer begins with known
@@ -144,6 +162,8 @@ class SteppingLogObserver(LogObserver):
         total = self.state.refused[1]
         evidence, spoiled, restarted = self._evidence_of(y, u, may_restart=self.may_restart and not fresh)
         self.u, fresh = self._begun(u), fresh or restarted
+        if restarted:
+            self.restarts, self.first_restart = self.restarts + 1, self.first_restart if self.restarts else time
         if fresh:
             self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
         elif nu and not finite[:nu].all():
