@@ -4,7 +4,7 @@ Tests marked ``long`` take seconds and are left to `.ci/run`, or to who names th
 
 `.ci/run` takes the tests marked ``sampled`` once more with the cases that were left out (``--rest``), and those marked
 ``numerics`` with other processors' kernels and with the oldest dependencies: of each the share whose turn it is
-(``--turn``), drawn by the commit, so that its time does not grow and a dozen or two of commits see them all.
+(``--turn``), drawn by the commit, so that its time does not grow and two or three dozen commits see them all.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXAMPLES, FEWER = 15, 5
 #: Without ``--whole`` or ``--rest`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
 #: With ``--turn`` one of so many tests is run, drawn by its argument.
-TURNS = 8
+TURNS = 12
 #: Files of tests that decide something numerically.
 NUMERIC = frozenset({
     "test_balls.py", "test_ball_arithmetic.py", "test_certain_covariance.py", "test_compiled_run.py",

@@ -106,6 +106,7 @@ def test_a_decay_of_a_nonlinear_plant_needs_no_samples_and_the_rest_says_what_is
         obsynth.conditions.region(model, {"x": [-1, 1]}, sample_time=1.0)
 
 
+@pytest.mark.long
 def test_remedies_of_outputs_that_change_and_of_late_faults_work() -> None:
     changing = {"A": [["a"]], "C": [["1 + a"]], "Bf": [[1]], "dt": 1.0}
     with pytest.raises(PreconditionError, match=r"changing: C\. Divide a measurement by what scales its row"):

@@ -68,6 +68,7 @@ class TestDetectability:
         with pytest.raises(PreconditionError, match=r"outgrow double precision at k = 12[0-9][0-9]: .*: 'x2'"):
             observer.run(np.zeros((1400, 1)))
 
+    @pytest.mark.long
     def test_nothing_forgets_what_is_claimed_to_be_known(self) -> None:
         plant = sampled(np.diag([0.5, 2]), np.eye(2))
         error = refusal(plant, Q=0.0, initial_covariance=np.diag([1.0, 0]))

@@ -114,6 +114,7 @@ def test_the_base_is_good(
     assert "pd-observer: all conditions hold" in capsys.readouterr().out
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("plant", [HIDDEN_STABLE, HIDDEN_PAIR], ids=["real", "pair"])
 def test_a_hidden_mode_that_decays_is_no_obstacle(
     plant: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

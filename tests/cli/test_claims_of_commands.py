@@ -85,6 +85,7 @@ TABLE: dict[str, tuple[list[str], str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_threshold_that_adapts_has_no_number_of_the_exact_model(capsys: pytest.CaptureFixture[str]) -> None:
     """That of the exact model was printed as the one within the tolerances."""
     command, _, _ = TABLE["evaluate, over tolerances"]
@@ -247,6 +248,7 @@ def test_the_least_gain_of_a_filter_is_that_of_its_matrices() -> None:
     assert obsynth.fault_estimation_filter(plant, weight="free", gamma=1.1).certificate.claims["gamma"] <= 1.1
 
 
+@pytest.mark.long
 def test_a_quiet_report_prints_nothing_on_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant = obsynth.DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0)
     gains, page = tmp_path / "filter.json", tmp_path / "page.html"

@@ -142,6 +142,7 @@ class TestDesign:
         assert recovery is not None
         assert recovery.flags() == ("exact", "needs the fault estimate")
 
+    @pytest.mark.long
     def test_smib(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("COLUMNS", "80")
         assert main(["design", "--system", str(SMIB), "--quiet"]) == 0
@@ -360,6 +361,7 @@ class TestEndings:
 
 
 class TestRealProcesses:
+    @pytest.mark.long
     def test_design(self, tmp_path: Path) -> None:
         done = run("design", "--system", str(WANG), "--json")
         assert done.returncode == 0, done.stderr

@@ -246,6 +246,7 @@ def test_a_plant_without_faults_is_not_said_to_have_some() -> None:
     assert "Neither" not in str(refused.value)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("words", "told"),
     [

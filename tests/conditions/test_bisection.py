@@ -59,6 +59,7 @@ def test_where_everything_is_feasible_the_other_end_is_the_result() -> None:
     assert np.isnan(found.infeasible)
 
 
+@pytest.mark.long
 def test_the_least_level_of_a_paper_is_that_of_the_riccati_equation() -> None:
     paper = obsynth.conditions.wang2015(PLANT, gamma=10.0)
     found = paper.bisect("gamma_squared", 100.0, 0.0, tolerance=1e-3)
@@ -68,6 +69,7 @@ def test_the_least_level_of_a_paper_is_that_of_the_riccati_equation() -> None:
     assert paper.design().report.passed
 
 
+@pytest.mark.long
 def test_levels_where_clarabel_stalls_are_refuted_by_scs() -> None:
     """Below the least, Clarabel says "infeasible, inaccurate" or fails; SCS finds the inequality infeasible."""
     by_one = obsynth.conditions.wang2015(PLANT, gamma=10.0).bisect("gamma_squared", 9.0, 1.0, solver="CLARABEL")

@@ -55,6 +55,7 @@ def test_bounded_real_of_a_given_level_is_feasible_above_the_norm_alone(dt):
         assert problem.status == status
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 @SOLVERS
 def test_h2_ends_at_the_norm(dt, solver):

@@ -75,6 +75,7 @@ def _daafouz(a: float) -> ErrorPolytope:
     return ErrorPolytope([A0 - a * turned, A0 + a * turned], np.zeros((0, 4)))
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize(("a", "lyapunov", "stable"), [
     (0.42, "common", True), (0.44, "common", False), (0.44, "vertex", True), (0.46, "vertex", True),
     (0.463, "vertex", False),

@@ -149,6 +149,7 @@ def test_a_missing_input_is_taken_as_in_python_and_a_step_without_a_solution_lea
     assert np.abs(np.delete(found["states"], 20, axis=0) / expected - 1.0).max() <= 1e-10
 
 
+@pytest.mark.long
 def test_both_files_carry_the_digest_of_the_gain_set(tmp_path, capsys) -> None:
     design = designed("diode_circuit")
     gains = design.save(tmp_path / "gains.json")

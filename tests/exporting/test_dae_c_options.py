@@ -150,6 +150,7 @@ def test_an_export_of_a_linear_design_says_that_it_knows_no_outliers(tmp_path) -
         obsynth.export(design, tmp_path / "a.c", outliers="none")
 
 
+@pytest.mark.long
 def test_a_sample_beside_a_missing_input_is_left_out_however_near_it_is(tmp_path) -> None:
     """As near as a fault may be, which is believed at once where the inputs are known."""
     design = tank_observer("augmented-kalman", OPTIONS["sizes"])

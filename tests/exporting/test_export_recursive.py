@@ -115,6 +115,7 @@ def test_c_equals_python_over_ten_thousand_steps(name, tmp_path):
     assert 'y[0]: "y1", operating point 3.0' in text
 
 
+@pytest.mark.long
 def test_arrays_and_state_space(tmp_path):
     design = designed("innovation")
     (path,) = obsynth.export(design, tmp_path / "steady.npz")
@@ -224,6 +225,7 @@ def test_a_sampling_time_is_a_positive_number(dt):
         obsynth.sample_observer(continuous, dt)
 
 
+@pytest.mark.long
 def test_gains_whose_last_digits_go_to_and_fro_have_settled() -> None:
     # After a thousand steps some entries moved by 8e-15 for ever, in other units of the states by nothing.
     plant = obsynth.DescriptorSystem(

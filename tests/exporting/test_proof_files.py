@@ -501,6 +501,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_what_is_no_proof_file_is_refused_in_one_line(hostile: str, tmp_path: Path) -> None:
     file = proof("fault-estimation-filter")
@@ -512,6 +513,7 @@ def test_what_is_no_proof_file_is_refused_in_one_line(hostile: str, tmp_path: Pa
     assert "Traceback" not in found.stderr
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"format": "obsynth-proof"}', "[" * 100_000])
 def test_files_of_other_kinds_are_refused(text: str, tmp_path: Path) -> None:
     place = tmp_path / "proof.json"

@@ -121,6 +121,7 @@ def test_designs_whose_file_would_say_too_little_are_refused_by_name() -> None:
         proof_of(obsynth.design(turning, "fault-estimation-filter"))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", WHOLE)
 def test_numbers_that_are_false_are_refused(name: str) -> None:
     """What courses that stay at a vertex, or alternate, reach already is never proved to be smaller."""

@@ -108,6 +108,7 @@ def test_the_random_walk_is_the_textbook_augmented_filter() -> None:
         assert (row.parameters.spread @ row.parameters.spread.T)[0, 0] == pytest.approx(P[2, 2], abs=1e-12)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("form", ["innovation", "literal"])
 @pytest.mark.parametrize("guard", ["none", "regularise", "directional"])
 def test_the_stated_covariances_are_those_of_the_errors(form: str, guard: str) -> None:

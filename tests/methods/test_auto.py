@@ -61,6 +61,7 @@ def test_where_nothing_exists_the_reason_and_the_sensor_are_given() -> None:
         obsynth.design(plant)
 
 
+@pytest.mark.long
 def test_spec_without_a_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (DESIGNS / "motor" / "one_encoder.yaml").read_text(encoding="utf-8").split("method:")[0]
     text = text.replace("[theta m, i]", "[theta m, theta l, i]").replace(

@@ -16,6 +16,7 @@ from obsynth.specs.loader import load_spec
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 
+@pytest.mark.long
 def test_the_curve_is_what_designs_claim() -> None:
     plant = load_spec(DESIGNS / "smib" / "functional.yaml").plant
     curve = delay_curve(plant, 0, 0.01)

@@ -236,6 +236,7 @@ def test_a_default_reference_has_the_order_that_a_finite_mean_square_needs() -> 
     assert np.shape(obsynth.optimal_filter(plant, norm="h2").options["reference"]["A"]) == (2, 2)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
 def test_outputs_that_need_derivatives_of_a_known_input_cost_nothing(norm: str):
     """Index 3, outputs with u and its first two derivatives: the least is that of the plant without the input."""

@@ -31,6 +31,7 @@ SAMPLED = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SAMPLED)
 def test_a_deviation_that_is_rounding_has_a_bound(name: str) -> None:
     design = obsynth.optimal_filter(obsynth.DescriptorSystem(**SAMPLED[name], dt=1.0), norm="h2", delay=2)

@@ -82,6 +82,7 @@ def test_refusal_names_the_load_and_the_sensor() -> None:
     assert caught.value.signals == ("torque",)
 
 
+@pytest.mark.long
 def test_delay_against_noise_is_what_monte_carlo_finds() -> None:
     plant = smib()
     found = delayed()
@@ -230,6 +231,7 @@ def test_banks_with_poles_as_asked() -> None:
         obsynth.functional_filter(tanks(), residuals="isolate", poles=[[0.9], [0.8], [0.7, 0.6]])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("sampled", [True, False])
 def test_monitors_of_residuals(sampled: bool) -> None:
     # The load torque acts all the time and is felt by none of them; sensor noise is what thresholds are against.
@@ -248,6 +250,7 @@ def test_monitors_of_residuals(sampled: bool) -> None:
             assert counted.missed_detection_rate.value == 0.0
 
 
+@pytest.mark.long
 def test_monitors_of_estimates_with_a_delay() -> None:
     design = delayed()
     scenario = obsynth.Scenario(horizon=6.0, faults={"tm GENCLS 1": obsynth.Step(size=0.5, start=3.0)})
@@ -303,6 +306,7 @@ ROUNDING_ROWS = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", ROUNDING_ROWS)
 def test_rows_of_rounding_are_zero_and_lose_no_filter(name: str) -> None:
     entries = {
@@ -323,6 +327,7 @@ ONE_NOISE = obsynth.DescriptorSystem(
 )  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 def test_the_gain_is_that_of_its_riccati_equation_whatever_the_solver_gives(
     dt: float, monkeypatch: pytest.MonkeyPatch
@@ -376,6 +381,7 @@ def test_a_default_walk_shows_a_step_where_none_does_at_once() -> None:
     assert design.observer.run(np.array(outputs)).faults[-1, 0] == pytest.approx(1.0, abs=0.5)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("seed", "times"), [(40134, 4), (52070, 256), (52298, 4096)])
 def test_a_default_walk_waits_twice_as_long_until_a_step_shows(seed: int, times: int) -> None:
     given = drawn_plant("functional-filter", seed)
@@ -450,6 +456,7 @@ def test_a_search_with_rough_gains_comes_to_the_same_walk(seed: int, monkeypatch
     np.testing.assert_allclose(walks[1], walks[1000], rtol=1.5 * np.log(10.0) * 0.5**rates.RATE_BISECTIONS)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 def test_a_filter_without_a_proof_of_stability_is_written_in_triangular_states(
     dt: float, monkeypatch: pytest.MonkeyPatch
@@ -468,6 +475,7 @@ def test_a_filter_without_a_proof_of_stability_is_written_in_triangular_states(
     )
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("n", "pole", "link", "measured", "fault"),
     [(8, 0.9987, 0.1144, [0, 5, 7], 5), (9, 0.9959, 0.0823, [0, 1], 8), (25, 0.993, 0.0874, [0, 4, 18, 19], 5)],

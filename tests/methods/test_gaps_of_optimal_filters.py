@@ -11,6 +11,7 @@ from obsynth.verification.invisible_faults import proved_least
 from obsynth.verification.seen_outputs import Setting, with_independent_outputs
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("seed", "most"),
     [
@@ -44,6 +45,7 @@ def read_by(mixing: np.ndarray, dt: float = 1.0) -> obsynth.DescriptorSystem:
     )
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("copy", [[1.0, 0.0, 0.0], [0.0, -2.0, 0.0]], ids=["copied", "copied with a factor"])
 def test_the_least_gain_of_a_plant_with_a_copied_sensor_is_that_without_it(copy: list[float]) -> None:
     once, twice = (
@@ -68,6 +70,7 @@ NEARLY_COPIED = np.vstack([np.eye(3), [0.3, 1.7, 0.0]])
 TIMES = {"discrete": (1.0, {"delay": 1}), "continuous": (0.0, {"reference": {"bandwidth": 2.0}})}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("time", TIMES)
 def test_a_sensor_that_depends_on_others_but_for_rounding_leaves_the_least_gain_proved(time: str) -> None:
     dt, options = TIMES[time]
@@ -94,6 +97,7 @@ def test_a_sensor_that_depends_on_others_but_for_rounding_leaves_the_least_gain_
     assert failing({}, dependent=np.array([[4.0]])) == {"fits the plant"}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("time", TIMES)
 def test_a_bound_beside_an_output_that_shows_something_is_below_the_gain_of_filters_that_read_it(time: str) -> None:
     """The last output is no combination of others: filters that answer it more may have less gain."""
@@ -122,6 +126,7 @@ def test_a_bound_beside_an_output_that_shows_something_is_below_the_gain_of_filt
     assert bound(own) <= design.gain < without.least
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 def test_equations_and_states_in_units_of_their_own_leave_gain_and_least(dt: float) -> None:
     """Of E with entries from 1e-4 to 1e8, equations were taken for algebraic ones, and the filter failed."""

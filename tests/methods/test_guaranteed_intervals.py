@@ -72,6 +72,7 @@ def signals(log: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     return log[["level 1", "level 2"]].to_numpy(), log[["pump"]].to_numpy()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SHIFTED)
 def test_the_threshold_is_that_of_the_half_widths_and_is_reached(name: str) -> None:
     d, v = SHIFTED[name]

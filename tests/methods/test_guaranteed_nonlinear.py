@@ -128,6 +128,7 @@ def test_no_healthy_tank_alarms_and_twice_the_threshold_does() -> None:
     assert max(healthy) > 0.3 * test.threshold
 
 
+@pytest.mark.long
 def test_it_says_what_it_rests_on_and_is_saved(tmp_path: Path) -> None:
     test = test_of_tank()
     words = "level stays within 3.8 to 4.2 m"
@@ -166,6 +167,7 @@ def changed(what: str) -> obsynth.ObserverDesign:
     return test.replace(plant=plant.replace(**{what: getattr(plant, what) * (1.0 + 1e-3)}))
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("what", ["bound", "region", "model", "sample time", "directions", "A", "B", "Bf", "C"])
 def test_what_is_changed_fails_the_row_on_the_remainder(what: str) -> None:
     assert "remainder" in {row.name for row in obsynth.verify(changed(what)).failures}
@@ -222,6 +224,7 @@ def test_models_without_a_bound_are_refused() -> None:
     assert obsynth.check(TANK, {"guaranteed-test": ASKED})["guaranteed-test"].passed
 
 
+@pytest.mark.long
 def test_the_command_line_designs_verifies_and_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant = {"kind": "dae", "equations": EQUATIONS, "outputs": {"gauge": "level"}, **FIELDS}
     document = {"schema_version": 1, "name": "tank", "plant": plant,

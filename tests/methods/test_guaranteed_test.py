@@ -113,6 +113,7 @@ def window_of(design: obsynth.ObserverDesign) -> Any:
     return window_as_designed(design.plant, GuaranteedTestMethod.of(design.options))
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", CASES)
 def test_thresholds_are_those_of_their_closed_forms(name: str) -> None:
     claims = designed(name).certificate.claims
@@ -122,6 +123,7 @@ def test_thresholds_are_those_of_their_closed_forms(name: str) -> None:
     assert designed(name).report.passed
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SPECS)
 def test_thresholds_of_shipped_designs(name: str, tmp_path: Path) -> None:
     claims = designed(name).certificate.claims
@@ -150,6 +152,7 @@ SHORT = (("designs/vehicle/spec.yaml", 3, 23.18), ("designs/vehicle/spec.yaml", 
          ("designs/smib/guaranteed_test.yaml", 3, 0.171), ("designs/smib/guaranteed_test.yaml", 5, 0.127))  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(("name", "samples", "printed"), SHORT)
 def test_short_windows_of_three_plants(name: str, samples: int, printed: float) -> None:
     spec = obsynth.load_spec(ROOT / name)

@@ -85,6 +85,7 @@ def test_no_plant_of_the_box_alarms_without_a_fault(name: str, share: Callable[.
     assert box.sentence in monitor(name).statement
 
 
+@pytest.mark.long
 def test_a_fault_alarms_and_the_nominal_threshold_is_less() -> None:
     box = spec().plant.uncertainty.box
     y, u = signals(box.values(np.zeros(len(box.names))), np.random.default_rng(1), fault=1.0)

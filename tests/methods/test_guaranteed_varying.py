@@ -165,6 +165,7 @@ SAME: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", SAME)
 def test_constant_matrices_have_the_thresholds_of_a_plant_without_time(name: str) -> None:
     A, C, psi = [[0.9, 0.3], [-0.2, 0.8]], [[1.0, 0.0], [1.0, 1.0]], [[1.0], [0.0]]
@@ -301,6 +302,7 @@ CORRUPTED = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("what", CORRUPTED)
 def test_what_is_corrupted_fails_its_row(what: str) -> None:
     assert CORRUPTED[what] in {row.name for row in obsynth.verify(corrupted(what)).failures}

@@ -59,6 +59,7 @@ def test_one_vertex_is_the_steady_filter() -> None:
     assert one.certificate.claims["region_deviation"] > np.trace(steady.P) ** 0.5
 
 
+@pytest.mark.long
 def test_a_scalar_filter_is_that_of_the_worst_pole() -> None:
     plant = PolytopicSystem(plant={"A": [["a"]], "C": [[1.0]], "dt": 1.0}, scheduling={"a": [0.5, 1.2]})
     made = obsynth.descriptor_kalman(plant, Q=1.0, R=1.0)

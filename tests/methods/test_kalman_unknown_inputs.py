@@ -60,6 +60,7 @@ def least_squares(plant, u, y):
     return found[-(nx + nd) : -nd]
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("direct", [0, 1, 2])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_as_least_squares_over_the_whole_record(direct, seed):
@@ -118,6 +119,7 @@ def test_units_do_not_decide_which_unknown_inputs_are_estimated(direct, equation
     assert first.note == second.note
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("seed", range(8))
 def test_a_known_input_may_be_late_where_an_unknown_one_enters_with_it(seed: int) -> None:
     """What turned equations leave of a delay's register was rounding, and the units of the states followed from it."""
@@ -174,6 +176,7 @@ def test_where_no_equation_is_left_an_estimate_follows_from_the_outputs_of_its_s
     np.testing.assert_allclose(found.state_deviations[-1], np.sqrt(np.diag(covariance)), rtol=1e-9)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("direct", "nd"), [(0, 1), (1, 1), (1, 2), (0, 2)])
 def test_the_adaptive_observer_learns_beside_any_unknown_input(direct: int, nd: int) -> None:
     """Of records without noise the parameters are learned exactly, however large the unknown inputs are."""

@@ -51,6 +51,7 @@ def test_a_stable_filter_is_found_whose_error_decays(name: str) -> None:
     assert np.max(np.abs(poles)) < 1.0 if plant.is_discrete else np.max(poles.real) < 0.0
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ["a constant", "a constant beside a noisy state", "an oscillation"])
 def test_its_gain_is_the_limit_of_plants_whose_mode_is_driven_less_and_less(name: str) -> None:
     plant, design = plant_and_filter(name)
@@ -110,6 +111,7 @@ ZEROS_ON_THE_BOUNDARY = {
 }
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
 @pytest.mark.parametrize("name", ZEROS_ON_THE_BOUNDARY)
 def test_a_zero_on_the_boundary_leaves_no_stable_filter(name: str, norm: str) -> None:

@@ -22,6 +22,7 @@ def late_sensor(delay: int) -> obsynth.DescriptorSystem:
     )  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
 def test_no_other_test_on_the_same_samples_is_below_the_least(delay: int) -> None:
     plant = late_sensor(delay)

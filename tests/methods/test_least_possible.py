@@ -57,6 +57,7 @@ def test_the_optimal_filter_is_at_the_least_itself() -> None:
     assert least_possible(quiet).delay == (1, 1)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ["filasova", "sharepasand", "motor"])
 def test_filters_that_minimise_the_noise_by_another_route_are_at_the_least(name: str) -> None:
     """The functional filter weighs the noise by a Kalman filter of its own: the least has the same deviation."""

@@ -43,6 +43,7 @@ def design() -> ObserverDesign:
     return _designed()
 
 
+@pytest.mark.long
 def test_of_one_state_the_block_loses_nothing(design: ObserverDesign) -> None:
     # All slopes at their upper ends together: x' = (-2 - 0.5 + 13 * 0.05) x.
     rate = 2.5 - float(np.arange(1.0, 14.0) @ SHARES)
@@ -99,6 +100,7 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", _CORRUPTIONS)
 def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> None:
     corrupt, row = _CORRUPTIONS[name]

@@ -82,6 +82,7 @@ def test_a_threshold_is_that_of_the_worst_course_between_samples(seed: int, tmp_
     assert obsynth.verify(obsynth.load(test.save(tmp_path / "test.json"))).passed
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(3))
 def test_held_disturbances_are_those_of_the_sampled_model(seed: int) -> None:
     """Without the plant behind it a sampled plant has no other course: the option gives its numbers to the digit."""
@@ -293,6 +294,7 @@ def test_unknown_inputs_of_a_nonlinear_plant_move_between_samples() -> None:
     assert test.report.passed
 
 
+@pytest.mark.long
 def test_the_independent_program_forms_the_same_columns(tmp_path: Path) -> None:
     plant, dt = plant_of(1)
     test = obsynth.guaranteed_test(obsynth.discretise(plant, dt), **ASKED)

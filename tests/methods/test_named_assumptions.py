@@ -52,6 +52,7 @@ def test_what_unknown_inputs_reach_is_not_called_estimated() -> None:
     assert abs(observer.Cz[observer.fault_rows] @ -driven + observer.Dy[observer.fault_rows] @ static)[0] > 0.5
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

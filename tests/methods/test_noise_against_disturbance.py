@@ -8,6 +8,7 @@ import pytest
 import obsynth
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("noise", [1.0, 0.01])
 @pytest.mark.parametrize("gamma", [None, 0.5, 0.01])
 def test_a_disturbance_that_only_the_free_measurement_feels(gamma, noise):

@@ -42,6 +42,7 @@ def test_a_sensor_that_says_nothing_of_the_states_takes_no_design_away(name: str
     assert obsynth.design(with_second_sensor(name), method, **METHODS[method]).report.passed
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SILENT)
 def test_a_detection_filter_has_the_same_claims_beside_a_sensor_that_says_nothing(name: str) -> None:
     row, direct, noise = SILENT[name]
@@ -87,6 +88,7 @@ def test_a_decay_is_reached_with_less_noise_than_by_a_gain_of_that_rate(seed: in
     assert design.certificate.claims["noise_amplification"] < 0.9 * faster.certificate.claims["noise_amplification"]
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("ratio", [1.5, -0.3, 1e4])
 @pytest.mark.parametrize("seed", [0, 1, 3, 4])
 def test_a_copy_in_another_unit_takes_no_fault_filter_away(seed: int, ratio: float) -> None:
@@ -127,6 +129,7 @@ def deviation_of(design: obsynth.ObserverDesign) -> float:
     return float(np.sqrt((row @ steady @ row.T + direct @ direct.T)[0, 0]))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("seed", "dt"), [(7, 0.2), (14, 0.0), (46, 0.0)])
 def test_a_copy_makes_no_default_slower_beside_process_noise(seed: int, dt: float) -> None:
     """The mean of two copies has less noise beside that of the process: the price of speed is no reason to be slow."""
@@ -215,6 +218,7 @@ def _deviation_behind_a_lag(design: obsynth.ObserverDesign, rate: float) -> floa
     return float(np.sqrt(scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)[-1, -1]))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", [1, 7])
 def test_one_sensor_more_costs_a_pd_observer_no_noise(seed: int) -> None:
     plants = _with_one_more(seed, 0.0)
@@ -226,6 +230,7 @@ def test_one_sensor_more_costs_a_pd_observer_no_noise(seed: int) -> None:
     assert min(-np.max(np.linalg.eigvals(design.observer.Az).real) for design in designs) >= 0.3
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("seed", "dt"), [(1, 0.0), (6, 0.2), (7, 0.0)])
 def test_one_sensor_more_costs_no_noise_at_given_poles(seed: int, dt: float) -> None:
     poles = [np.exp(-dt * rate) if dt else -rate for rate in (3.0, 3.3, 3.6, 4.0)]

@@ -322,6 +322,7 @@ NOT_TOLD = [
 ]  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(("case", "options", "truth"), [pytest.param(*case[1:], id=case[0]) for case in NOT_TOLD])
 def test_what_cannot_be_told_need_not_be_told(case, options, truth) -> None:
     """Disturbances that are decoupled, and faults whose sum is wanted, need not be told from each other."""
@@ -373,6 +374,7 @@ def test_faults_that_a_disturbance_hides_are_refused() -> None:
             obsynth.optimal_filter(case, decoupled="d1", **options)
 
 
+@pytest.mark.long
 def test_the_statement_has_bounds_one_more_sample_and_the_limit() -> None:
     design = obsynth.optimal_filter(ZERO_AT_2, delay=1)
     assert design.notes[0] == (
@@ -526,6 +528,7 @@ def test_a_weight_of_the_noise_is_a_model_of_it(case, delay, norm) -> None:
     assert "weighted error" in str(weighted.report) or norm == "h2"
 
 
+@pytest.mark.long
 def test_numbers_scale_errors_and_noise() -> None:
     """Two faults on two outputs: the larger of what each error counts times its noise."""
     case = plant(A=[[0.0]], Bf=[[0, 0]], Bw=[[0, 0]], C=[[0], [0]], Df=np.eye(2), Dw=np.eye(2))

@@ -38,6 +38,7 @@ def test_noise_in_the_equations_of_motion_is_carried_to_the_free_states() -> Non
         np.testing.assert_allclose(own, full @ full.conj().T, rtol=1e-9, atol=1e-12 * np.abs(own).max())
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("method", ["descriptor-kalman", "adaptive-observer"])
 def test_noise_that_a_constraint_differentiates_is_refused_with_what_is_taken(method: str) -> None:
     plant = masses()

@@ -131,6 +131,7 @@ def test_a_filter_that_is_small_enough_is_left_as_it_is() -> None:
     assert limited.notes == full.notes
 
 
+@pytest.mark.long
 def test_too_few_states_are_refused_with_the_order_that_works() -> None:
     case = plant(0, nd=1)
     with pytest.raises(obsynth.InfeasibleError, match=r"at least \d .*order_limit=\d+\.$") as refusal:

@@ -105,6 +105,7 @@ class TestOptions:
         assert np.max(eigenvalues(design).real) < -5.0
         assert np.max(np.linalg.eigvals(np.linalg.solve(d, without)).real) > -5.0
 
+    @pytest.mark.one_in(5)
     @pytest.mark.parametrize("disk", [[5.0, 4.5], [10.0, 9.0], [3.0, 2.8], [50.0, 49.9], [1.0, 3.0]])
     def test_disk(self, disk: list[float]) -> None:
         design = obsynth.pd_observer(PLANT, disk=disk)
@@ -117,6 +118,7 @@ class TestOptions:
         assert np.max(np.abs(found + 10.0)) < 9.0
         assert np.max(found.real) < -2.0
 
+    @pytest.mark.one_in(3)
     @pytest.mark.parametrize("bound", [2.5, 5.0, 30.0])
     def test_gain_bound(self, bound: float) -> None:
         free = obsynth.pd_observer(PLANT, delta=0.1, decay=0.0, fault_rate_gain=0.25)
@@ -134,6 +136,7 @@ class TestOptions:
         assert free.report["gain"].value > 5.5 >= bounded.report["gain"].value
         assert np.max(eigenvalues(bounded).real) < -2.0
 
+    @pytest.mark.one_in(3)
     @pytest.mark.parametrize("gain", [0.7, 0.3, 0.1])
     def test_fault_rate_gain(self, gain: float) -> None:
         for plant in (PLANT, rich()):
@@ -307,6 +310,7 @@ class TestDefaults:
         plant = obsynth.DescriptorSystem(None, [[0.0, 1.0], [0.0, 0.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
         assert obsynth.pd_observer(plant).options["delta"] == 1.0
 
+    @pytest.mark.long
     def test_gains_stay_small_for_every_delta(self) -> None:
         """The trap: plain feasibility with P1 >= I gives 1.4e9 at delta = 1, a maximal margin 3e13."""
         scan = obsynth.sweep(PLANT, {"delta": np.logspace(-3, 0, 7).tolist(), "decay": [0.0]}, method="pd-observer")
@@ -352,6 +356,7 @@ class TestWhenTheSolverFails:
 
 
 class TestCertificates:
+    @pytest.mark.long
     def test_a_certificate_is_found_up_to_the_true_decay_rate_and_not_beyond(self) -> None:
         for plant in (PLANT, rich()):
             observer = obsynth.pd_observer(plant).observer
@@ -384,6 +389,7 @@ class TestCertificates:
         assert prove_symmetric_positive(p1).proved
         assert prove_gains(a, none.T, none, none, p1, p3, delta=delta, decay=0.0).proved
 
+    @pytest.mark.long
     def test_an_l2_gain_is_proved_down_to_the_norm_and_not_below(self) -> None:
         for plant in (PLANT, rich()):
             design = obsynth.pd_observer(plant)
@@ -403,6 +409,7 @@ class TestCertificates:
                 assert gain_certificate(observer.Az, entering, shown, (1.0 - 1e-6) * norm) is None
                 assert not prove_gain(-observer.Az, entering, shown, found, 10.0 * norm).proved
 
+    @pytest.mark.long
     def test_both_forms_of_the_inequality_agree(self) -> None:
         design = obsynth.pd_observer(rich(), decay=0.3)
         augmented = with_faults_as_states(design.plant)
@@ -423,6 +430,7 @@ class TestCertificates:
 class TestRunning:
     """Continuous plants sampled finely, the observer by a first-order hold."""
 
+    @pytest.mark.one_in(2)
     @pytest.mark.parametrize("decay", [0.5, 3.0])
     def test_states_and_faults_come_back(self, decay: float) -> None:
         design = obsynth.pd_observer(rich(), decay=decay)
@@ -575,6 +583,7 @@ def test_the_doors_options_are_those_of_the_method() -> None:
     assert door == inside
 
 
+@pytest.mark.long
 def test_norms_of_the_report_are_those_of_the_realisation() -> None:
     """Third route: plant and shipped observer as one system, for a plant that is stable itself."""
     plant = rich().replace(A=rich().A - 5.0 * np.eye(3))
@@ -587,6 +596,7 @@ def test_norms_of_the_report_are_those_of_the_realisation() -> None:
     assert design.report["disturbance in the fault estimate"].value == pytest.approx(norm.upper, rel=1e-7)
 
 
+@pytest.mark.long
 def test_a_sensor_that_shows_its_noise_alone_is_hardly_used() -> None:
     """In units in which it shows the states as the others do its gains were cheap: noise of .09 became 55."""
     noise = []

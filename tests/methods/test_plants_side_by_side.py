@@ -35,6 +35,7 @@ def both() -> obsynth.DescriptorSystem:
     )
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("method", ["ui-pi-observer", "functional-filter", "pd-observer"])
 def test_what_each_has_both_have_and_neither_sees_the_other(method: str) -> None:
     design = obsynth.design(both(), method)

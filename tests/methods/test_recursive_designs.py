@@ -195,6 +195,7 @@ def linear_file() -> Path:
 
 
 class TestBatch:
+    @pytest.mark.one_in(6)
     @pytest.mark.usefixtures("taken_as_verified")
     @pytest.mark.parametrize("name", FORMS)
     def test_trials_are_runs(self, name: str) -> None:
@@ -230,6 +231,7 @@ class TestSpec:
         path.write_text(text)
         return path
 
+    @pytest.mark.long
     def test_from_the_command_line_to_a_file_and_back(self, tmp_path: Path, capsys) -> None:
         path, gains = self.write(tmp_path), tmp_path / "gains.json"
         assert main(["design", "--system", str(path), "--output", str(gains), "--quiet", "-v"]) == 0

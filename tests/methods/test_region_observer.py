@@ -226,6 +226,7 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", _CORRUPTIONS)
 def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> None:
     corrupt, row = _CORRUPTIONS[name]
@@ -360,6 +361,7 @@ def test_a_growing_mode_that_no_output_shows_is_named() -> None:
         obsynth.region_observer(model, region={"z": [-0.5, 1.0]}, sample_time=0.1, noise={"y": 0.1, "fault": 0.1})
 
 
+@pytest.mark.long
 def test_a_step_is_found_where_newton_alone_goes_round_in_circles() -> None:
     model = DAEModel(
         {
@@ -390,6 +392,7 @@ def test_a_step_is_found_where_newton_alone_goes_round_in_circles() -> None:
         assert end == pytest.approx(ends[0], abs=1e-9)
 
 
+@pytest.mark.long
 def test_slow_plants_have_a_decay_too() -> None:
     # A store of 1e9 units: its rates are 1e-10 of those of a plant in seconds.
     store = DAEModel(
@@ -401,6 +404,7 @@ def test_slow_plants_have_a_decay_too() -> None:
     assert made.report.passed
 
 
+@pytest.mark.long
 def test_rates_alone_do_not_run_away_where_noise_is_stated() -> None:
     model = DAEModel(
         {"a": "der(x) = -x + 0.5 * sin(z)", "b": "der(z) = -z + 0.3 * tanh(x)"}, {"y1": "x", "y2": "z"},

@@ -37,6 +37,7 @@ def test_a_multiple_takes_no_design_away_and_is_decoupled(method: str, factor: f
     assert np.max(np.abs(estimates / [1.0, factor])) < 1e-9
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("options", [{}, {"decay": 0.5}, {"joint": True}])
 @pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0, 7e4])
 def test_a_multiple_that_outputs_show_takes_no_design_away(factor: float, options: dict[str, float]) -> None:

@@ -35,6 +35,7 @@ def steady_covariance(design: obsynth.ObserverDesign) -> FloatArray:
     return np.asarray(P[np.ix_(states, states)])
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("noises", [2, 3, 7])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_steady_covariance_is_that_of_the_riccati_equation_with_a_cross_term(seed: int, noises: int) -> None:
@@ -46,6 +47,7 @@ def test_the_steady_covariance_is_that_of_the_riccati_equation_with_a_cross_term
     np.testing.assert_allclose(steady_covariance(design), filtered_covariance(plant), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", [4, 26, 35])
 def test_outputs_of_fewer_noises_leave_no_rounding_in_the_filter(seed: int) -> None:
     """Three outputs of two noises tell four states exactly after some samples: nothing is left that has a covariance,

@@ -79,6 +79,7 @@ def known_exactly(seed: int) -> tuple[DescriptorSystem, np.ndarray, np.ndarray]:
 ROUNDED = (45, 50, 75, 85)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("seed", ROUNDED)
 def test_rounding_of_a_state_that_is_known_exactly_is_no_noise(seed: int) -> None:
@@ -109,6 +110,7 @@ def test_an_algebraic_equation_without_noise_does_not_contradict_an_estimate_tha
     assert design.report.passed
 
 
+@pytest.mark.long
 def test_a_steady_state_that_is_known_exactly_has_gains_by_which_errors_of_rounding_decay() -> None:
     plant, Q, R = known_exactly(50)
     steady = obsynth.steady_state_filter(plant, Q=Q, R=R)
@@ -164,6 +166,7 @@ def test_what_is_claimed_to_be_known_must_be() -> None:
     assert {"NEES", "batch: covariance"} <= wrong
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("variance", [1e-8, 1e-12, 1e-16])
 def test_a_regressor_that_tends_to_zero(variance: float) -> None:
     plant = sampled(TURN, np.eye(2), Bf=[[1], [0]])

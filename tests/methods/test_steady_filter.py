@@ -80,6 +80,7 @@ SINGULAR = {
 }
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", SINGULAR)
 def test_singular_noise(name: str) -> None:
@@ -92,6 +93,7 @@ def test_singular_noise(name: str) -> None:
     assert steady.rate < 1.0
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("seed", range(8))
 def test_random_plants_with_singular_noise(seed: int) -> None:
@@ -105,6 +107,7 @@ def test_random_plants_with_singular_noise(seed: int) -> None:
         np.testing.assert_allclose(last.factor @ last.factor.T, steady.P, rtol=0, atol=1e-10 * np.linalg.norm(steady.P))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("A", "mode", "text"),
     [(np.diag([1.0, 0.5]), 1.0, "at z = 1 the noise"), ([[0.0, 1], [-1, 0]], 1j, "at z = 0 +- 1j the noise")],

@@ -32,6 +32,7 @@ PLANTS = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", PLANTS)
 def test_it_is_designed_and_passes(name: str) -> None:
     plant, model = PLANTS[name]
@@ -75,6 +76,7 @@ def test_parts_of_a_fault_that_can_hardly_be_told_apart_are_said_to_make_it_slow
     assert not any("give decay or poles" in note for note in usual.notes)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("dt", "frequency"), [(0.1, 1e-4), (0.1, 1e-3), (0.0, 1e-5)])
 def test_the_price_in_noise_is_that_of_the_gain_that_is_shipped(dt: float, frequency: float) -> None:
     # In the states of the fault model the covariance is lost in rounding, and a price of zero was once claimed.
@@ -100,6 +102,7 @@ def test_a_rate_at_which_rounding_moves_the_estimate_says_so() -> None:
     assert any("While 'f1' is constant, rounding as the observer runs" in note for note in design.notes)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("decay", [1e5, 1e6])
 @pytest.mark.parametrize("joint", [False, True])
 def test_gains_that_drown_a_unit_fault_in_rounding_are_no_design(decay: float, joint: bool) -> None:
@@ -144,6 +147,7 @@ def test_a_fault_model_that_is_lost_in_rounding_is_unclear() -> None:
     assert not check(PAPER, {"ui-pi-observer": options})["ui-pi-observer"].passed
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("region", [{"damping": 0.7}, {"damping": 0.7, "decay": None}, {"radius": 50.0}])
 def test_a_region_without_a_decay_is_no_reason_to_be_slow(region: dict[str, float]) -> None:
     slowest = ui_pi_observer(PAPER, region=region).certificate.claims["decay"]
@@ -169,6 +173,7 @@ def test_noise_is_given_in_order_or_by_name() -> None:
         ui_pi_observer(plant, noise={"measurement": [2.0]})
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("size", [1.0, 0.3, 1e-3, -1.0])
 def test_a_pseudoinverse_that_loses_an_equation_is_refused_for_it(size: float) -> None:
     # A coil, a capacitor across an ideal source (index 2), and a second coil with an unknown voltage.

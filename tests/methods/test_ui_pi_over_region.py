@@ -70,6 +70,7 @@ def test_estimates_follow_whatever_the_unknown_input_and_the_course_do(sampled: 
     assert np.abs(found.states[-10:] - x[-10:]).max() < 1e-6
 
 
+@pytest.mark.long
 def test_errors_decay_as_is_proved_in_discrete_time(sampled: ObserverDesign) -> None:
     rate, P = sampled.certificate.claims["region_decay"], sampled.certificate.matrices["P_region"][0]
     rng, Az = np.random.default_rng(1), sampled.scheduled[1].Az
@@ -81,6 +82,7 @@ def test_errors_decay_as_is_proved_in_discrete_time(sampled: ObserverDesign) -> 
     assert 0.5 * rate < worst <= rate
 
 
+@pytest.mark.long
 def test_errors_decay_as_is_proved_in_continuous_time(continuous: ObserverDesign) -> None:
     rate, P = continuous.certificate.claims["region_decay"], continuous.certificate.matrices["P_region"][0]
     rng, Az, step = np.random.default_rng(2), continuous.scheduled[1].Az, 0.01
@@ -118,6 +120,7 @@ def _noise_at_rest(design: ObserverDesign) -> float:
     return float(max(found))
 
 
+@pytest.mark.long
 def test_the_noise_is_told_and_a_smaller_drive_of_the_faults_makes_it_less(continuous: ObserverDesign) -> None:
     told = continuous.report["noise amplification at rest"].value
     assert told == pytest.approx(_noise_at_rest(continuous), rel=1e-6)
@@ -133,6 +136,7 @@ def test_a_decay_that_is_asked_for_is_proved() -> None:
     assert obsynth.ui_pi_observer(continuous_plant(), decay=3.0).certificate.claims["region_decay"] >= 3.0
 
 
+@pytest.mark.long
 def test_one_vertex_is_the_plain_observer() -> None:
     point = sampled_plant().center
     one = obsynth.ui_pi_observer(PolytopicSystem([point]))

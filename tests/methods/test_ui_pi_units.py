@@ -54,6 +54,7 @@ def in_si_units(model: str) -> ObserverDesign:
     return ui_pi_observer(masses([1, 1, 1, 1], 1.0), fault_model=MODELS[model])
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("frequency", [1e-4, 1e3, 3e3, 1e4, 1e5, 1e9])
 def test_a_resonator_of_any_frequency(frequency: float) -> None:
     slow, fast = of_one_hertz(), ui_pi_observer(resonator(frequency))
@@ -80,6 +81,7 @@ def test_two_masses_in_any_units(states: list[float], time: float, model: str) -
     assert other.certificate.claims["noise_price"] == pytest.approx(own.certificate.claims["noise_price"], rel=1e-4)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("options", [{"decay": 2.0}, {"region": {"decay": 1.0, "radius": 30.0}}, {"joint": True}])
 def test_every_way_to_choose_gains_in_microseconds(options: dict) -> None:
     def in_microseconds(value: object) -> object:
@@ -94,6 +96,7 @@ def test_every_way_to_choose_gains_in_microseconds(options: dict) -> None:
     assert spectrum_error(other.observer.Az, 1e6 * np.linalg.eigvals(own.observer.Az), 0.0) < 1e-3
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("size", [1e-9, 1e-6, 1e6])
 def test_the_unit_of_a_fault_plays_no_role(size: float) -> None:
     plants = [DescriptorSystem(None, [[-1.0, 1], [0, -2]], C=[[1, 0]], Bf=[[0], [unit]]) for unit in (1.0, size)]
@@ -162,6 +165,7 @@ def slow_chain(n: int, pole: float, link: float, measured: list[int], fault: int
     return DescriptorSystem(A=a, C=c[measured], Bf=c[:, [fault]], dt=1.0)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("n", "pole", "link", "measured", "fault"),
     [(10, 0.978, 0.019, [0, 8], 8), (14, 0.988, 0.015, [0, 6, 7], 9), (10, 0.977, 0.25, [0, 9], 8)],

@@ -71,6 +71,7 @@ def test_a_deviation_that_is_small_beside_what_the_noise_could_do_is_claimed_and
     assert OptimalFilterMethod(**options).existence(less_noise)[-1].holds
 
 
+@pytest.mark.long
 def test_a_long_delay_keeps_no_state_that_hardly_counts() -> None:
     """With 47 states, of which 15 count, no gain near that of the filter was proved: the default was inconclusive."""
     rng = np.random.default_rng([98, 6, 2])

@@ -45,6 +45,7 @@ def test_a_free_weight_removes_a_disturbance_that_the_paper_s_does_not():
     assert free.certificate.claims["gamma"] < 0.01
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", PLANTS)
 def test_by_default_the_free_weight_is_taken_where_it_lowers_gamma_and_both_gains_are_told(name):
     plant = obsynth.DescriptorSystem(**PLANTS[name], dt=1.0)
@@ -89,6 +90,7 @@ def _left_inverses(plant: obsynth.DescriptorSystem, count: int) -> tuple[np.ndar
     return upsilon, [np.linalg.pinv(upsilon) + rng.normal(size=(nf, ny - nf)) @ free for _ in range(count)]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_given_weight_is_kept_and_its_gain_is_that_of_the_inequality(name):
     plant = obsynth.DescriptorSystem(**PLANTS[name], dt=1.0)
@@ -149,6 +151,7 @@ def test_a_spec_may_state_the_weight_and_the_gain_set_keeps_it(tmp_path):
     assert obsynth.verify(again)["gains: given W"].passed
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("stored", [[[1.0, 0.0, 0.0]], [["a"]], "W", [[None, 0.0, 0.0]], {}, 1.0])
 def test_a_stored_weight_that_is_not_w_fails_its_row(stored):
     plant = obsynth.DescriptorSystem(**PLANTS["three states"], dt=1.0)

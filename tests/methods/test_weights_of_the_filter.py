@@ -61,6 +61,7 @@ def compared(seeds: range) -> int:
     return count
 
 
+@pytest.mark.long
 def test_the_papers_weight_is_that_of_the_papers_inequality() -> None:
     assert compared(range(4)) == 4
 

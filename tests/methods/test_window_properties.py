@@ -221,6 +221,7 @@ def threshold_by_another_solver(design: obsynth.GuaranteedTest) -> float:
     return -float(found.fun)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("course", ["constant", "any", "ramp"])
 @pytest.mark.parametrize("seed", range(2))
 def test_threshold_and_least_enclose_what_bounds_can_hide(seed: int, course: str) -> None:

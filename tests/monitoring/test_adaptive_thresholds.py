@@ -177,6 +177,7 @@ def test_columns_of_a_run() -> None:
     assert again.equals(table)
 
 
+@pytest.mark.long
 def test_refusals_name_their_reason() -> None:
     design = obsynth.fault_estimation_filter(drive())
     with pytest.raises(SpecError, match="no entry for the state 'x2'"):
@@ -436,6 +437,7 @@ def test_designs_without_residuals_are_watched_by_their_estimates() -> None:
     assert (obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0).table["alarm"] != "").any()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("p", [0.95, 1.0, 1.05])
 def test_residuals_that_are_zero_but_for_rounding_refuse_no_bound(p: float) -> None:
     # An observer decoupled from d reads x3 = y2 as it is: that residual, and what the fault follows, are 1e-16.

@@ -235,6 +235,7 @@ NILE = np.array([
 ], dtype=float)  # fmt: skip
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("factor", [1.0, 1e-3, 1e6])
 def test_the_nile_in_any_units(factor):
     """Durbin and Koopman 2001, section 2.10: the likelihood is greatest at R = 15,099, Q = 1,469.1."""

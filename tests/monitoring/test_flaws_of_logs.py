@@ -47,6 +47,7 @@ def log(*, fault: float = 0.0, rows: int = ROWS) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["time", "u", "a", "b"])
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("blank", [["b"], ["a"], ["a", "b"], ["u"]])
 def test_blank_cells_are_predicted_over_by_every_linear_method(method: str, blank: list[str]) -> None:
@@ -72,6 +73,7 @@ def test_a_state_of_a_filter_without_states_goes_on_as_if_it_had_not_been_saved(
     pd.testing.assert_frame_equal(whole, pd.concat([first, second], ignore_index=True))
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("method", METHODS[1:])
 @pytest.mark.parametrize("blank", [["a"], ["b"], ["a", "b"]])
 def test_what_is_measured_is_taken_beside_blank_cells_and_rows_decide_again_within_noise(
@@ -203,6 +205,7 @@ def turning(design: obsynth.ObserverDesign, *, rows: int = 330, fault: float = 0
     return pd.DataFrame({"time": np.arange(rows) * plant.dt, plant.input_names[0]: u, **signals})
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("blank", [(0,), (1,), (0, 1)])
 @pytest.mark.parametrize("name", ["drive", *METHODS[1:]])
 def test_a_pointwise_threshold_grows_by_what_missing_outputs_hide_and_decides_at_once(name: str, blank: Any) -> None:
@@ -480,6 +483,7 @@ def test_runs_live_on_over_flaws_and_keep_the_estimate(tmp_path: Path, method: s
     np.testing.assert_allclose(well["fhat[f]"], same, atol=0.02)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("flaw", FLAWS)
 def test_a_slow_filter_lives_on_too(flaw: str) -> None:
     data = flawed(flaw)
@@ -616,6 +620,7 @@ def test_calibration_reads_the_rows_that_a_run_takes(flaw: str) -> None:
         read_log(stuck, ["u"], ["a", "b"], dt=DT)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("flaw", ["blank cell", "blank row", "gap", "text cell"])
 def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
     data = flawed(flaw)
@@ -677,6 +682,7 @@ def test_linear_observers_run_in_batches_and_say_what_decides_of_them() -> None:
         obsynth.decide(recursive().observer, [1.0])
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("blank", [["a"], ["b"], ["a", "b"]])
 @pytest.mark.parametrize("method", METHODS[1:])
 def test_a_blank_cell_of_a_plant_at_rest_starts_nothing_again(method: str, blank: list[str]) -> None:

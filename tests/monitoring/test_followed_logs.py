@@ -138,6 +138,7 @@ def test_a_process_that_is_killed_goes_on_where_its_state_is(tmp_path: Path) -> 
     assert list(dict.fromkeys([*first, *second[1:], *third[1:]])) == expected
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize(
     ("more", "said"),
     [

@@ -42,6 +42,7 @@ def same(design: obsynth.ObserverDesign, found: object, wanted: object, **option
     return one
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(
     ("kind", "has_name"),
     [*((kind, True) for kind in ("dates", "zone", "differences", "numbers", "counted")),
@@ -83,6 +84,7 @@ def test_dates_with_a_zone_of_another_kind_of_frame_are_read(design, frame):
     same(design, log.convert_dtypes(dtype_backend="pyarrow"), log)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(
     ("unit", "per_second"), [("s", 1), ("[s]", 1), ("ms", 1000), ("(min)", 1 / 60), ("", 1), ("h", 1 / 3600)]
 )
@@ -161,6 +163,7 @@ def test_units_behind_names_are_left_out_and_say_what_the_times_are(design, fram
         obsynth.run_on_data(design, log.assign(**{"level (ft)": 0.0}))
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", ["level status", "level.Quality", "LEVEL_STATUS", "level [Quality]", "Status"])
 @pytest.mark.parametrize("kind", ["frame", "csv", "parquet"])
 def test_values_that_their_status_calls_bad_are_missing(design, frame, tmp_path, name, kind):
@@ -285,6 +288,7 @@ def channel(frame: pd.DataFrame, name: str, **options: object) -> object:
 of_asammdf = pytest.mark.filterwarnings("ignore::DeprecationWarning:asammdf", "ignore::DeprecationWarning:numpy")
 
 
+@pytest.mark.one_in(4)
 @of_asammdf
 @pytest.mark.parametrize("name", ["valve", "level"])
 @pytest.mark.parametrize("apart", [False, True])

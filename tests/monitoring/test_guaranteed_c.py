@@ -99,6 +99,7 @@ def test_c_equals_the_run_on_a_log_with_blanks(name: str, tmp_path: Path) -> Non
     assert np.array_equal(np.isnan(found[:, 0]), unknown)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("option", [{"exact": True}, {"missing": "solve"}])
 @pytest.mark.parametrize("suffix", [".c", ".npz", ".fmu"])
 def test_what_solves_programmes_is_not_exported(option: dict[str, object], suffix: str, tmp_path: Path) -> None:

@@ -123,6 +123,7 @@ def test_three_levels_isolate_three_faults() -> None:
     assert {event.fault for event in run.events} == {"leak 2"}
 
 
+@pytest.mark.long
 def test_a_bank_over_many_runs_is_never_wrong(tmp_path: Path) -> None:
     size = 2.0 * three().tests[0].threshold
     scenario = obsynth.load_spec(ROOT / "designs/tanks/spec.yaml").scenario.replace(

@@ -242,6 +242,7 @@ def test_a_log_with_what_can_be_read_is_taken_and_what_is_missing_is_said(
     assert says(" ".join(replayed(folder, log)), sentences.get("compare", ""))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["parquet", "xlsx", "a folder", "a text"])
 def test_files_of_other_kinds_are_refused_in_the_same_sentences(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str

@@ -118,6 +118,7 @@ def test_ranges_are_saved_and_a_resumed_run_goes_on_with_them(tmp_path: Path) ->
     assert all(event.beyond == ("u",) for event in parts[1].events)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("column", ["a", "b"])
 def test_an_output_is_named_where_two_samples_in_a_row_leave_its_range(column: str) -> None:
     monitor = obsynth.online_monitor(design(), "learned", normal=learned())

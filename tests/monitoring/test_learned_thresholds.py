@@ -353,6 +353,7 @@ def test_what_follows_exactly_from_the_rows_before_is_no_evidence_behind_a_missi
     assert 350.0 <= run.alarms["learned"] <= 365.0
 
 
+@pytest.mark.long
 def test_runs_go_on_from_a_saved_state(tmp_path: Path) -> None:
     monitor, data, state = obsynth.online_monitor(heated(), "learned", normal=learned()), log(300, 2), tmp_path / "s"
     whole = obsynth.run_on_data(heated(), data, monitor=monitor).table

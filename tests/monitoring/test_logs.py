@@ -327,6 +327,7 @@ def test_words_are_bad_samples_wherever_they_stand_and_however_a_log_is_read(des
         assert said.endswith(f"first 'Bad' in row {first + 1}.")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("way", ["frame", "csv", "stream", "parquet"])
 def test_a_column_of_words_is_no_signal(design, tmp_path, way):
     log = with_words(list(range(WORD_ROWS)))

@@ -32,6 +32,7 @@ def observer(early: bool = False, **adapt: object) -> RecursiveObserver:
     return observer_for(varying(horizon=SAMPLES), adapt=adapt, early_constraints=early)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("early", [False, True])
 @pytest.mark.parametrize("form", FORMS)
 def test_gains_reproduce_a_run_with_gaps(form: str, early: bool) -> None:

@@ -146,6 +146,7 @@ def test_a_bounded_disturbance_can_pass_the_papers_threshold_but_not_the_pointwi
     assert worst > 0.8 * ours
 
 
+@pytest.mark.long
 def test_false_alarms_as_measured_in_the_audit(printed, wang) -> None:
     """About 5 % of the runs with the paper's threshold (4.9 % of 5000 in the audit); none with the pointwise bound."""
     quiet = wang[1].replace(faults={}, horizon=80)

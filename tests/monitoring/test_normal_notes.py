@@ -141,12 +141,14 @@ def test_an_offset_that_each_start_divides_anew_is_told(offset: bool) -> None:
     assert [note.startswith("The estimate of bias stays what the start") for note in notes] == [True] * offset
 
 
+@pytest.mark.long
 def test_an_event_that_raises_the_levels_by_little_is_none() -> None:
     data = log(0)
     data.loc[EVENT.start : EVENT.stop - 1, "ya"] += 0.07
     assert learned(data).notes == ()
 
 
+@pytest.mark.long
 def test_a_stuck_sensor_is_told_by_the_command_and_kept_in_the_file(tmp_path: Path, capsys) -> None:
     data = log(1)
     data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]
@@ -162,6 +164,7 @@ def test_a_stuck_sensor_is_told_by_the_command_and_kept_in_the_file(tmp_path: Pa
     assert obsynth.load_thresholds(file).notes == tuple(notes)
 
 
+@pytest.mark.long
 def test_what_a_stuck_sensor_repeats_is_not_learned_from() -> None:
     """Levels were those of a sensor that is stuck: they are those of a log that is blank there."""
     data = log(1)
@@ -280,6 +283,7 @@ def test_quantised_signals_are_not_stuck_until_they_are(seed: int, memory: float
     assert stuck_rows(values) == [(1_000, last)]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("step", "least"), [(1.0, 13), (2.0, 16), (3.0, 16)])
 def test_coarse_sensors_that_stick_are_told_in_noise(step: float, least: int) -> None:
     """Steps in deviations of the noise.  Three single steps before were taken for a course that comes to rest: of these
@@ -331,6 +335,7 @@ def test_stuck_rows_do_not_depend_on_the_pieces_of_a_log(rows: int) -> None:
     assert gathered.stuck() == [[], [(1_000, 1_039), (2_990, 2_999)]]
 
 
+@pytest.mark.long
 def test_a_stuck_sensor_is_told_by_runs_of_files_and_of_streams(tmp_path: Path, capsys) -> None:
     data = log(1)
     data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]

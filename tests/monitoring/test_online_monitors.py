@@ -61,6 +61,7 @@ def test_shares_of_looks_sum_up_to_one_and_no_more():
     assert total == pytest.approx(epochs[-1], rel=1e-12)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", ["pointwise", "window", "paper"])
 def test_thresholds_are_those_of_a_record(kind, wang):
     design, scenario = wang
@@ -163,6 +164,7 @@ def response(a: np.ndarray, b: np.ndarray, c: np.ndarray, t: float) -> float:
     return float(np.linalg.norm(c @ expm(a * t) @ b))
 
 
+@pytest.mark.long
 def test_peak_gains_are_integrals():
     from scipy.integrate import quad
 
@@ -274,6 +276,7 @@ def test_a_continuous_design_on_a_log(machine):
         obsynth.online_monitor(machine, "pointwise", disturbance_bounds={"load": 0.5}, noise_bound=5.0)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["chi-square", "cusum"])
 def test_stamps_that_jitter_are_decided_by_as_regular_ones_are(kind):
     """From 2 % of the interval on nothing was decided; intervals that are all another one are still told apart."""
@@ -481,6 +484,7 @@ def test_options_of_another_kind_are_refused_by_name(kind, wang):
             assert refused.value.path == name
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["pointwise", "window"])
 def test_what_has_no_bound_at_any_stamps_has_none_and_no_nan(kind: str) -> None:
     """Modes that last are bent by the disturbance: between stamps anywhere nothing is bounded, and inf - inf was."""

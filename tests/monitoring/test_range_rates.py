@@ -67,6 +67,7 @@ def rates(learned: obsynth.types.LearnedThresholds) -> np.ndarray:
     return learned.ranges.rates
 
 
+@pytest.mark.long
 def test_levels_follow_the_input_whose_gain_is_wrong_and_no_other() -> None:
     first, second = rates(thresholds()), rates(learned_from(log((0.0, 0.3))))
     assert first[0].min() > 2.0 * first[1].max()

@@ -194,6 +194,7 @@ def test_random_inputs_raise_no_alarm_and_a_fault_does(design: ObserverDesign) -
     assert (loud[202:] > limit).all()
 
 
+@pytest.mark.long
 def test_the_statement_says_for_which_courses_and_a_log_has_the_alarm(design: ObserverDesign, tmp_path: Any) -> None:
     monitor = _monitor(design)
     assert "for every course of v in the region" in monitor.statement

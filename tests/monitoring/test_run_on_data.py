@@ -186,6 +186,7 @@ def test_the_plant_model_bridges_a_gap(sampled, how):
     assert found["status"].iloc[-1] == "ok"
 
 
+@pytest.mark.long
 def test_a_gap_in_continuous_time_is_bridged(continuous):
     """The true plant with a constant fault; in the gap the estimate follows the plant, which is unstable."""
     plant = obsynth.eliminate_algebraic_states(continuous.linear[0])
@@ -408,6 +409,7 @@ class TestSameResults:
         table = run_on_data(design, frame, thresholds=levels).table
         pd.testing.assert_frame_equal(pd.read_parquet(folder / "out.parquet"), table, check_dtype=False)
 
+    @pytest.mark.one_in(6)
     @pytest.mark.parametrize("cut", [1, 12, 20, 33, 34])
     def test_when_stopped_and_gone_on(self, case, cut):
         design, source, wanted, folder = case

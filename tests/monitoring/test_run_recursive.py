@@ -294,6 +294,7 @@ def test_deviations_are_honest_in_a_gap():
     assert ((ratio[:2] > 0.8) & (ratio[:2] < 1.2)).all()
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["recursive", "linear"])
 def test_scales_of_a_plant_are_those_of_its_log(kind):
     """What the log holds, times the factor, is in the signal's unit; a call may say otherwise."""

@@ -85,6 +85,7 @@ def alarms(residuals: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.long
 def test_noise_that_became_slower_is_an_alarm_until_it_has_swung_and_faults_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -109,6 +110,7 @@ def test_noise_that_became_slower_is_an_alarm_until_it_has_swung_and_faults_are_
     assert found_in_slow_noise[AT:].mean() > 0.9
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_a_run_says_since_when_levels_are_raised() -> None:
     plant = obsynth.DescriptorSystem(

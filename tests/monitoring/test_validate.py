@@ -224,6 +224,7 @@ def test_steps_are_judged_by_all_of_a_sensors_noise(tank_design):
     assert not any("backward Euler" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_wrong_constant_is_named_with_the_value_that_explains_the_log(tank_design):
     found = validate(tank_design, emptying_tank(400, c=0.13))
     assert not found.passed

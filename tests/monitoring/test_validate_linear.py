@@ -77,6 +77,7 @@ def test_what_is_not_white_is_named_with_its_period() -> None:
     assert found.to_dict()["sensors"]["y1"]["largest_power"]["period"] == period
 
 
+@pytest.mark.long
 def test_single_wrong_samples_are_no_disagreement() -> None:
     log = log_of(PLANT)
     log.loc[[100, 200], "y1"] += 30.0

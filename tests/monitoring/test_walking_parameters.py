@@ -46,6 +46,7 @@ def record(jump: float = 0.0, samples: int = 160):
     return true, u, path
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_a_reset_follows_a_jump_and_nothing_else(form):
     slow = {**OPTIONS, "form": form, "forgetting": 0.998}

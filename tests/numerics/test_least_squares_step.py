@@ -163,6 +163,7 @@ HARD = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", HARD)
 def test_it_holds_where_the_printed_form_does_not(name: str) -> None:
     case, tolerance, printed_fails = HARD[name]
@@ -326,6 +327,7 @@ class TestCovarianceFactor:
         assert caught.value.path == "Q(3)"
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("directions", [6, 4])
 @pytest.mark.parametrize("seed", range(6))
 def test_priors_far_from_each_other_keep_the_digits_of_accurate_sensors(seed: int, directions: int) -> None:

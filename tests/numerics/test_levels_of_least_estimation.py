@@ -9,6 +9,7 @@ import obsynth
 from obsynth.numerics import least_estimation
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", [3, 8])
 def test_few_equations_lead_to_the_least_gain(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bisection to the same share takes 27 of them."""

@@ -264,6 +264,7 @@ class TestDesigns:
         Bd=[[0.0], [1], [0]], fault_names=["leak"],
     )  # fmt: skip
 
+    @pytest.mark.long
     def test_every_way_to_choose_gains_passes_and_keeps_the_fixed_mode(self) -> None:
         for options in (
             {}, {"poles": [-3, -3, -3]}, {"decay": 2.0}, {"region": {"decay": 1.0, "radius": 20.0}},
@@ -297,6 +298,7 @@ class TestDesigns:
         assert again.options["fault_model_in_words"] == {"leak": "sinusoid of 2 rad/s"}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_what_poles_leave_free_is_spent_on_noise(dt: float) -> None:
     """The same poles, and less of the noise in the estimate, which is summed sample by sample."""

@@ -1,11 +1,13 @@
 """A level is refuted only where it does not hold, also where rounding in the doubling outgrows every margin."""
 
 import numpy as np
+import pytest
 
 from obsynth.numerics.gain_levels import compared_gain
 from obsynth.numerics.norms import balanced_realisation, hinf_norm
 
 
+@pytest.mark.long
 def test_no_level_that_holds_is_refuted():
     far = 0
     for seed in range(120):

@@ -227,6 +227,7 @@ class TestTheChoice:
             observer.run(record(observer.plant, 5)[0], compiled=True)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("units", [1.0, 1e3])
 def test_a_factorisation_that_has_settled_is_kept_and_changes_nothing(single_steps, units: float) -> None:
     """Records many times longer than the filter's memory, with states of different sizes, and parameters that walk."""

@@ -319,6 +319,7 @@ def test_functions_of_python_run_as_c_as_well() -> None:
     assert shipped.run(y, u, compiled=True).states == pytest.approx(shipped.run(y, u).states, abs=1e-12)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("compiled", [None, False, True])
 def test_a_step_that_becomes_singular_along_the_run_is_named(compiled) -> None:
     """The gain of a sensor falls to nothing: what it shows no longer determines the state behind it."""
@@ -348,6 +349,7 @@ def test_a_step_that_becomes_singular_along_the_run_is_named(compiled) -> None:
     running.step(y[23], u[22])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("form", ["forgetting", "augmented-kalman"])
 def test_without_parameters_it_is_a_kalman_filter_of_the_states(form) -> None:
     tank = DAEModel(

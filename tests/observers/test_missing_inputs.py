@@ -149,6 +149,7 @@ def test_the_inputs_of_delayed_samples_may_be_missing() -> None:
     np.testing.assert_allclose(found.state_deviations, wanted.state_deviations, rtol=1e-12)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("rows", [2, 6, 15])
 @pytest.mark.parametrize("method", ["ui-pi-observer", "fault-estimation-filter"])
 def test_levels_of_linear_designs_decide_after_inputs_that_were_missing(method: str, rows: int) -> None:

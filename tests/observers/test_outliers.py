@@ -72,6 +72,7 @@ def test_one_sample_off_by_a_million_costs_a_nonlinear_observer_less_than_two_de
         design.observer.run(spoiled, u)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["gate", "huber"])
 def test_one_sample_off_by_a_million_costs_a_recursive_observer_less_than_two_deviations(kind):
     y, u = filter_record()
@@ -84,6 +85,7 @@ def test_one_sample_off_by_a_million_costs_a_recursive_observer_less_than_two_de
     assert (np.abs(found.parameters - wanted.parameters)[late] < 2.0 * wanted.parameter_deviations[late]).all()
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["gate", "huber"])
 def test_a_record_without_outliers_is_as_before(kind):
     y, u = filter_record()
@@ -185,6 +187,7 @@ def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one
     assert np.array_equal(again.x, row.x)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_a_sample_nearer_than_outliers_are_is_believed_at_once(kind):
     """A log told how far off its outliers are: what is nearer may be a fault, however many deviations it is."""

@@ -83,6 +83,7 @@ def test_late_values_are_put_where_they_belong(kind) -> None:
     np.testing.assert_allclose(some.states[11], smooth(plain, arrived(y, 14), u[:15]).states[11], atol=1e-12)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("form", ["forgetting", "augmented-kalman"])
 def test_late_values_of_a_nonlinear_plant(form) -> None:
     rng = np.random.default_rng(2)

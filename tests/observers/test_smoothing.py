@@ -236,6 +236,7 @@ def test_a_lag_is_the_whole_record_of_what_is_there(form) -> None:
         np.testing.assert_allclose(found.parameter_deviations[k], part.parameter_deviations[k], rtol=1e-10)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("form", "linear"),
     [("forgetting", "innovation"), ("augmented-kalman", "random-walk"), ("random-walk", "random-walk")],
@@ -341,6 +342,7 @@ def uncertain_inputs(u: np.ndarray) -> np.ndarray:
     return found
 
 
+@pytest.mark.long
 def test_logs_with_gaps_are_smoothed_like_arrays(tmp_path) -> None:
     y, u = record()
     design, frame = shifted_design(), log(y, u)

@@ -42,6 +42,7 @@ def random_plant(
     return plant, q * units**2, r
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("noise_free", [False, True])
 @pytest.mark.parametrize("nf", [0, 2])
 @pytest.mark.parametrize("seed", range(2))
@@ -57,6 +58,7 @@ def test_gains_settle_in_any_units(seed: int, nf: int, noise_free: bool) -> None
         )
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("faults", [False, True])
 def test_slow_gains_settle_in_few_steps_where_the_recursion_ends(faults: bool) -> None:
     # Two modes that almost keep their value, one of them with hardly any noise: 4,900 steps one after the other.
@@ -72,6 +74,7 @@ def test_slow_gains_settle_in_few_steps_where_the_recursion_ends(faults: bool) -
     np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.long
 def test_faults_that_the_sensors_cancel_have_settled() -> None:
     # As many exact sensors as states: the state is read off, and what faults do to its estimate is rounding of zero.
     rng = np.random.default_rng(98)
@@ -86,6 +89,7 @@ def test_faults_that_the_sensors_cancel_have_settled() -> None:
     np.testing.assert_allclose(settled.observer.Dy[:3] @ plant.C, np.eye(3), atol=1e-6)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("faults", [False, True])
 def test_gains_of_which_a_rest_decays_over_millions_of_steps_settle(faults: bool) -> None:
     # A rest of 1e-8 was left to the recursion, which took all of its steps and said that there is no limit.

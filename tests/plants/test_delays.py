@@ -242,6 +242,7 @@ def test_nothing_takes_a_continuous_plant_with_delays_as_if_it_had_none(call):
         call(delayed())
 
 
+@pytest.mark.long
 def test_a_pade_model_says_that_it_is_one():
     made = obsynth.absorb_delays(delayed(), 3)
     plant = made.plant

@@ -119,6 +119,7 @@ def rounded_sums(seed, *, proper):
     return plant, n
 
 
+@pytest.mark.long
 def test_rounding_of_a_does_not_make_algebraic_equations_solvable():
     # Those that only the last digits of A make regular were solved, and the result was another plant.
     for seed in range(12):
@@ -230,6 +231,7 @@ def test_an_output_of_constrained_states_alone_shows_nothing_of_computed_coordin
         assert obsynth.functional_filter(plant, decay=0.5).report.passed
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("method", ["pd-observer", "ui-pi-observer", "functional-filter"])
 def test_a_refusal_of_a_reduced_plant_names_what_was_left_out_and_states_as_written(method):
     # x1 + f = 0 and x2 = x1': the second output is the derivative of the fault.

@@ -41,6 +41,7 @@ def plant() -> obsynth.PolytopicSystem:
     return obsynth.linearise(_trailer(), given={"v": 1.0}, disturbances=["gust"], region=_REGION, scheduling=["v"])
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("v", [0.5, 0.9, 1.0, 1.7, 2.0])
 def test_every_point_is_the_linear_model_there(plant: obsynth.PolytopicSystem, v: float) -> None:
     other = obsynth.linearise(

@@ -301,6 +301,7 @@ class TestIdleVariables:
 class TestUnits:
     """Nothing is found singular, and no derivative lost, because of the units that equations and variables are in."""
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize(("rows", "columns"), [(10, 0), (0, 6), (6, 6), (10, 10)])
     def test_decades(self, rows, columns):
         network = random_network(300, 60, 11)

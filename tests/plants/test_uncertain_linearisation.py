@@ -31,6 +31,7 @@ def changed(model: DAEModel, values: dict[str, float]) -> DAEModel:
                             for name, group in groups.items()})  # fmt: skip
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("model", "arguments", "box"),
     [
@@ -140,6 +141,7 @@ def tank_rows(point, a1: float, b1: float) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["time", "u1", "u3", "v1", "v2", "v3"])
 
 
+@pytest.mark.long
 def test_a_spec_with_tolerances_of_a_nonlinear_plant_watches_logs_of_it(tmp_path: Path) -> None:
     (tmp_path / "spec.yaml").write_text(SPEC, encoding="utf-8")
     spec = load_spec(tmp_path / "spec.yaml")

@@ -87,6 +87,7 @@ def next_to_singular(rng: np.random.Generator, size: int, towards: float) -> np.
     return matrix
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("size", [12, 30, 64])
 def test_one_unit_in_the_last_place_decides(size: int) -> None:
     """A Gram matrix of rank n - 1 is definite once any diagonal entry grows, and indefinite once one shrinks."""

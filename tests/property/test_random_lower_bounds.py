@@ -152,6 +152,7 @@ def noisy_plant(seed: int, nx: int) -> obsynth.DescriptorSystem:
     return obsynth.DescriptorSystem(e, a, None, next(parts), Bf=next(parts), Bd=0.3 * next(parts), dt=0.1)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("nx", [5, 8])
 def test_runs_of_a_few_samples_prove_the_least_gain_of_small_filters(nx):
     """Neither the two steps nor a semidefinite solver: what is proved is below the gain of the filter in hand."""

@@ -37,6 +37,7 @@ def test_the_verdict_is_that_of_the_pencil(number: int, share: Share) -> None:
         assert decided(case) == brute_force(case)[0], (seed, case.kind, case.model)
 
 
+@pytest.mark.long
 def test_every_kind_of_plant_is_there_with_both_verdicts() -> None:
     found = Counter((case.kind, brute_force(case)[0]) for case in map(random_case, ALL))
     assert {kind for kind, _ in found} == set(KINDS)

@@ -70,6 +70,7 @@ def test_no_method_is_slower_or_noisier_for_a_sensor_more(method, kind):
     assert more.certificate.claims["decay"] >= alone.certificate.claims["decay"] / 1.001
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("kind", MORE)
 @pytest.mark.parametrize("seed", range(1, 4))
 def test_a_fault_filter_exists_with_a_sensor_more_and_has_no_more_noise(seed, kind):
@@ -99,6 +100,7 @@ def test_a_matrix_that_is_given_for_independent_outputs_is_named():
     assert obsynth.fault_estimation_filter(plant).report.passed
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("nd", [0, 1])
 @pytest.mark.parametrize("seed", range(3))
 def test_outputs_that_depend_on_others_get_another_left_inverse_than_the_paper_s(seed, nd):

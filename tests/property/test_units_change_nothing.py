@@ -110,6 +110,7 @@ def test_hidden_faults_are_refused_for_the_same_reason_in_all_units(method, seed
 UNITS = ([7.1e2, 3.3e-3, 41.0, 0.17], [0.023, 670.0], [5.9, 0.083], 17.3)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("case", ["filasova", "one slow", "oscillator"])
 def test_a_pd_observer_claims_and_is_the_same_in_all_units(case):
     """Not powers of two: the rate that is imposed, the eigenvalues and the gains are the same but for the units."""

@@ -270,6 +270,7 @@ class TestPictures:
         wanted = np.abs(obsynth.fault_response(continuous, found.frequencies)[:, 0, 0])
         assert np.allclose(found.gains["faults"], wanted, rtol=1e-6)
 
+    @pytest.mark.long
     def test_decoupled_disturbances_are_said_not_to_get_through(self, continuous):
         assert not estimate_gains(continuous).gains["disturbances"].any()
         labels = [text.get_text() for text in plot_gains(continuous).get_legend().get_texts()]

@@ -106,6 +106,7 @@ def test_the_page_renders_and_nothing_sticks_out(page: Path, tmp_path: Path) -> 
             assert 300 < shown <= width
 
 
+@pytest.mark.long
 @needs_browser
 def test_the_measurement_sees_what_sticks_out_and_what_is_fetched(tmp_path: Path) -> None:
     broken = tmp_path / "broken.html"

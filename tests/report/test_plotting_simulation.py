@@ -40,6 +40,7 @@ def line(axes, start: str):
     return next(item for item in axes.get_lines() if str(item.get_label()).startswith(start))
 
 
+@pytest.mark.long
 def test_faults_residual_threshold_and_alarm(wang) -> None:
     design, scenario, simulation = wang
     found = obsynth.monitor(design, scenario).watch(simulation.estimates)

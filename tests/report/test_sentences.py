@@ -156,6 +156,7 @@ def test_every_assumption_has_its_part_in_the_digest_and_in_the_words() -> None:
     assert shown(1e15) == "1000000000000000.0"
 
 
+@pytest.mark.long
 def test_a_course_that_is_no_sine_moves_an_estimate_further_than_the_page_says_of_sines() -> None:
     # The estimate follows the fault and, beside it, an oscillation that the disturbance drives.
     a, b, d = np.array([[0.5, 0.6, 0.0], [0.0, 0.7, 0.6], [0.0, -0.6, 0.7]]), np.eye(3)[:, :1], np.eye(3)[:, 2:]
@@ -261,6 +262,7 @@ def test_noise_of_a_continuous_design_is_that_of_a_rate_of_readings(between: flo
     assert 5.0 * deviation == pytest.approx(float(found.group(1)) * np.sqrt(between), rel=0.02)
 
 
+@pytest.mark.long
 def test_runs_that_are_all_alike_are_called_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = DESIGNS / "filasova" / "spec.yaml"
     gains = tmp_path / "gains.json"

@@ -110,6 +110,7 @@ def test_two_specs_of_one_name_keep_their_gain_sets(tmp_path, monkeypatch, capsy
     assert len(list(tmp_path.glob("*.json"))) == 2
 
 
+@pytest.mark.long
 def test_check_says_one_line_per_method(capsys):
     assert main(["check", "--system", str(DESIGNS / "filasova" / "spec.yaml")]) == 0
     printed = capsys.readouterr().out

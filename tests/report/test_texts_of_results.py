@@ -83,6 +83,7 @@ RESULTS: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
 }
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", RESULTS)
 def test_the_text_of_a_result_is_for_readers(name: str) -> None:
     make, words = RESULTS[name]

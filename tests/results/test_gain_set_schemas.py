@@ -88,6 +88,7 @@ def test_exact_numbers_behind_a_plant_of_many_states_are_known_to_rounding(smib,
     assert {check.name for check in verify(moved(many, Fraction(1, 10**8))).failures} == {"plant as written"}
 
 
+@pytest.mark.long
 def test_what_is_stored_twice_is_compared(smib):
     """Names, units, operating point, noise and tolerances stand in the plant and in the plant as written."""
     written, plant = smib.source.plant, smib.plant

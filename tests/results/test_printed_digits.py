@@ -94,6 +94,7 @@ def assert_hidden_indexes_are_told(seed: int) -> None:
     assert not any("give indexes=" in note for note in kept.notes)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("indexes", [[], [1, 2, 3, 4, 5, 6, 7], [0], "1", [1.0], 1, [99], [True]])
 def test_indexes_are_one_whole_number_for_each_fault(indexes: object) -> None:
     plant = DescriptorSystem(None, [[0.5, 1.0], [0.0, 0.4]], C=[[1, 0]], Bf=[[0], [1]], dt=1.0)

@@ -179,6 +179,7 @@ def changed(value):
 
 
 class TestTampering:
+    @pytest.mark.long
     def test_every_change_of_every_value_is_detected(self, design):
         document = json.loads(json.dumps(design_as_dict(design)))
         body = document["design"]

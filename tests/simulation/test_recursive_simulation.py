@@ -190,6 +190,7 @@ def test_the_command_simulates_a_varying_plant(tmp_path: Path, capsys: pytest.Ca
 # Many runs
 
 
+@pytest.mark.long
 def test_decisions_over_many_runs(shifted) -> None:
     scenario = obsynth.Scenario(horizon=150, noise=1, faults={"clog": obsynth.Step(size=0.3, start=75)})
     monitor = obsynth.ParameterMonitor(statistic="chi-square", false_alarms=0.05)
@@ -231,6 +232,7 @@ def test_a_small_change_is_missed_and_another_fault_is_blamed(shifted) -> None:
     assert (found.missed_detection_rate.value, found.isolation_error_rate.value) == (0.0, 1.0)
 
 
+@pytest.mark.long
 def test_a_kalman_filter_has_errors_only_and_a_dae_decisions_too(shifted, nonlinear) -> None:
     kalman = obsynth.descriptor_kalman(shifted.plant, Q=1e-4, R=1e-2)
     found = obsynth.evaluate(kalman, obsynth.Scenario(horizon=20, noise=1), runs=10)
@@ -244,6 +246,7 @@ def test_a_kalman_filter_has_errors_only_and_a_dae_decisions_too(shifted, nonlin
     assert decided.false_alarm_rate.value == 0.0
 
 
+@pytest.mark.long
 def test_monitors_go_with_their_designs(shifted, varying) -> None:
     spec = load_spec(DESIGNS / "wang2015" / "spec.yaml")
     linear = obsynth.fault_estimation_filter(spec.plant)

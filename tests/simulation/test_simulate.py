@@ -332,6 +332,7 @@ def test_index_two_is_refused_with_the_reason() -> None:
     assert caught.value.condition == "index"
 
 
+@pytest.mark.long
 def test_a_continuous_plant_needs_a_sample_time(sharepasand) -> None:
     with pytest.raises(SpecError, match="needs a sample_time"):
         obsynth.simulate(sharepasand[0], obsynth.Scenario(horizon=1))

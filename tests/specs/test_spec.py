@@ -342,6 +342,7 @@ class TestShippedDesigns:
         assert np.count_nonzero(plant.Df) == 0
         np.testing.assert_array_equal(plant.Dw, np.diag([1e-4, 1e-3, 1e-3]))
 
+    @pytest.mark.long
     def test_every_design_folder_has_a_spec_with_its_name(self) -> None:
         folders = sorted(path.name for path in DESIGNS.iterdir() if path.is_dir())
         assert {"smib", "wang2015", "wang2015_printed_psi"} <= set(folders)

@@ -44,6 +44,7 @@ def test_an_interpreter_shows_results_as_their_text(bicycle: obsynth.Comparison)
     )
 
 
+@pytest.mark.long
 def test_a_notebook_shows_the_picture(bicycle: obsynth.Comparison) -> None:
     """It shows the figures that pyplot knows; a page leaves none open."""
     import matplotlib.pyplot as plt

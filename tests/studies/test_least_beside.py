@@ -79,6 +79,7 @@ def test_no_record_passes_the_bound_of_an_observer_that_is_slower_than_the_plant
         assert 0.3 * worst * (1.0 - 1e-9) <= stated <= 0.3 * worst * (1.0 + 1e-5)
 
 
+@pytest.mark.long
 def test_a_comparison_says_that_gains_which_move_are_taken_once_they_have_settled() -> None:
     plant = obsynth.DescriptorSystem(
         A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1}, noise_names=["n1"]

@@ -100,6 +100,7 @@ def test_sentences_tell_box_runs_and_log(files: dict[str, Path]) -> None:
     assert all(len(text.split()) < 75 for text in told.values())
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_changed_gain_set_fails_by_name(files: dict[str, Path], tmp_path: Path, kind: str) -> None:
     def change(body: dict[str, Any]) -> None:
@@ -151,6 +152,7 @@ def test_a_changed_figure_fails_by_name(files: dict[str, Path], tmp_path: Path, 
     assert "figures" in failing(changed(files[kind], tmp_path / "c.json", change))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_another_sentence_fails_by_name(files: dict[str, Path], tmp_path: Path, kind: str) -> None:
     def change(body: dict[str, Any]) -> None:
@@ -170,6 +172,7 @@ def test_the_box_inside_is_compared(files: dict[str, Path], tmp_path: Path) -> N
     assert {"figures", "statement"} <= failing(changed(files["robustness"], tmp_path / "c.json", change))
 
 
+@pytest.mark.long
 def test_what_was_asked_is_done_again(files: dict[str, Path], tmp_path: Path) -> None:
     for kind, key, value in (
         ("comparison", "runs", 4),

@@ -136,6 +136,7 @@ def test_an_option_and_a_claim_of_the_same_name_have_a_column_each(spec):
     assert rows[0][header.index("certified gamma")] == found.results[0].claims["gamma"]
 
 
+@pytest.mark.long
 def test_plants_in_memory():
     plant = obsynth.DescriptorSystem(None, [[0.5, 0.1], [0, 0.7]], C=np.eye(2), Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0)
     found = obsynth.sweep(

@@ -78,6 +78,7 @@ def test_what_is_missed_is_judged_by_the_option(method: str) -> None:
 TURNING = {"Phi": [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]], "Cw": [[1.0, 0.0]]}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("limit", [5e-4, 2e-3, 0.5])
 def test_no_limit_is_taken_where_nothing_is_claimed_of_constant_faults(limit: float) -> None:
     plant = DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1.0], [0.0]], dt=0.1)

@@ -265,6 +265,7 @@ def test_other_plants_and_methods_are_refused_by_kind() -> None:
     assert {method for method, report in found.items() if report.passed} == {"dae-adaptive-observer"}
 
 
+@pytest.mark.long
 def test_notes_say_what_is_not_told_and_what_is_slow() -> None:
     units = {name: unit for name, unit in exchanger().units.items() if name != "temperature"}
     model = exchanger(outputs={"pressure": "p2 + psi"}, units=units)

@@ -586,6 +586,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
 }  # fmt: skip
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_good_design_passes(name: str) -> None:
     design = good(name)

@@ -350,6 +350,7 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", GOOD)
 def test_a_good_design_passes(name: str) -> None:
     design = good(name)

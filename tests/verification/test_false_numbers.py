@@ -20,6 +20,7 @@ DESIGNS = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("method", DESIGNS)
 def test_a_constant_that_is_added_to_an_estimate_fails(method: str) -> None:
     design = DESIGNS[method]()
@@ -110,6 +111,7 @@ def test_a_negative_decay_is_none() -> None:
     assert not forgetting_row(0.99999, 100_001.0, discrete=True).passed
 
 
+@pytest.mark.long
 def test_unknown_inputs_are_decoupled_in_any_unit() -> None:
     plant = obsynth.PolytopicSystem(
         plant={
@@ -125,6 +127,7 @@ def test_unknown_inputs_are_decoupled_in_any_unit() -> None:
     assert np.all(missed <= 1e-12 * np.abs(plant.vertices[0].Bd).max(axis=0))
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("method", ["ui-pi-observer", "functional-filter"])
 @pytest.mark.parametrize("model", ["ramp", {"f1": "ramp"}, {"sinusoid": 3.0}, {"exponential": -1e-6}])
 def test_an_observer_for_steps_is_named_as_one(method: str, model: object) -> None:

@@ -54,6 +54,7 @@ def test_a_listed_gain_that_does_not_run_is_refused(name: str) -> None:
         assert any(row.startswith("gains") for row in failures(design.replace(gains={**design.gains, letter: changed})))
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", MAKERS)
 def test_letters_and_shapes_are_those_of_the_method(name: str) -> None:
     design = made(name)

@@ -42,6 +42,7 @@ def test_one_vertex_is_the_filter_of_the_paper() -> None:
     assert one.certificate.claims["gamma"] == pytest.approx(paper.certificate.claims["gamma"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_conditions_of_the_paper_at_four_vertices() -> None:
     found = obsynth.conditions.wang2015(wang())
     assert [name for name in found.constraints if name.startswith("(45)")] == [f"(45)[{i}]" for i in (1, 2, 3, 4)]
@@ -157,6 +158,7 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
 }
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", _CORRUPTIONS)
 def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> None:
     corrupt, row = _CORRUPTIONS[name]
@@ -182,6 +184,7 @@ def test_an_effect_that_is_too_small_is_refused(scaled: ObserverDesign) -> None:
         obsynth.fault_estimation_filter(PolytopicSystem(**gone))
 
 
+@pytest.mark.long
 def test_a_gain_set_is_the_design_again(tmp_path: Path, scaled: ObserverDesign) -> None:
     again = obsynth.load(scaled.save(tmp_path / "region.gains.json"))
     assert obsynth.verify(again).passed
@@ -337,6 +340,7 @@ def _random_region(seed: int, *, outputs: int = 2) -> PolytopicSystem:
     return PolytopicSystem([obsynth.DescriptorSystem(np.eye(3), A + v * turn, **shared, dt=1.0) for v in (-1.0, 1.0)])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("rate", [1e-9, 0.1, 1e9])
 def test_a_rate_keeps_a_gain_of_zero(rate: float) -> None:
     plant = PolytopicSystem(

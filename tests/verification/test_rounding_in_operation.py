@@ -53,6 +53,7 @@ def worst_run(observer: LinearObserver, y: np.ndarray, row: int, roundings: int)
     return float(abs(cz @ error) + last)
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("seed", range(8))
 def test_the_worst_of_all_roundings_comes_near_the_bound(seed: int) -> None:
     observer, y = observer_of(seed)

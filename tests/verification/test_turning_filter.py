@@ -60,6 +60,7 @@ def test_faults_are_exact_for_wild_courses(design: ObserverDesign) -> None:
     assert np.abs(found.faults[observer.forgetting :] - f[observer.forgetting - 1 : -1]).max() < 0.05
 
 
+@pytest.mark.long
 def test_disturbances_pass_by_less_than_is_proved(design: ObserverDesign) -> None:
     plant, observer = design.scheduled
     gamma = design.certificate.claims["gamma"]
@@ -129,6 +130,7 @@ _CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] 
 }  # fmt: skip
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", _CORRUPTIONS)
 def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> None:
     corrupt, row = _CORRUPTIONS[name]
@@ -187,6 +189,7 @@ def test_c_corrects_as_python_does(tmp_path: Path, design: ObserverDesign) -> No
     assert np.array_equal(found[after:, 0] == 0, claimed[after:])
 
 
+@pytest.mark.long
 def test_without_disturbances_the_decay_is_proved() -> None:
     made = obsynth.fault_estimation_filter(turning_plant())
     assert made.report.passed
