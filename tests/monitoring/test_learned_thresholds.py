@@ -395,6 +395,26 @@ def test_rows_of_a_warm_up_are_what_the_next_are_predicted_from() -> None:
     assert max(statistics[40:]) < 1e-9
 
 
+@pytest.mark.parametrize("warm_up", [0, 1])
+def test_rows_that_are_predicted_from_before_the_first_one_are_no_evidence(warm_up: int) -> None:
+    """A UI-PI observer of a two-mass drive settles in four rows, and its estimate follows exactly from six: statistics
+    of every healthy log were 1e10 times their level for its first 200 rows."""
+    found = learned()
+    count, channels = len(watched_names(heated())), found.statistics.model.channels
+    past = np.array([0.997 * np.eye(channels), *np.zeros((2, channels, channels))])
+    model = Autoregression(np.zeros(channels), past, 1e5 * np.eye(channels))
+    assert model.rests_on_the_past
+    rule = LearnedRule(replace(found, statistics=replace(found.statistics, model=model)), watched_names(heated()))
+    nothing, state, statistics = np.zeros(0), rule.init(), []
+    for k in range(60):
+        observation = LinearSample(np.full(count, 5.0 * 0.997**k + (k == 50)), nothing, nothing, 0)
+        state, judged = rule.step(state, Sample(k * DT, nothing, nothing, observation, deciding=k >= warm_up))
+        statistics.append(judged.statistic)
+    assert np.isnan(statistics[:warm_up]).all()
+    assert max(statistics[warm_up:50]) < 1e-6
+    assert statistics[50] > 1.0
+
+
 @pytest.mark.long
 def test_too_few_rows_are_told() -> None:
     short = obsynth.learn_thresholds(heated(), log(400, 0), false_alarms="1 per day")

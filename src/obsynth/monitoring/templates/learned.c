@@ -529,6 +529,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     int seen[CHANNELS];
     REAL most = (REAL)HUGE_VAL;
     int known, sign, i, j;
+    /* The first rows are predicted from rows that were not there. */
+    if (MONITOR_RESTS && innovation < 0 && m->taken == 0) {
+        m->to_wait = ORDER;
+    }
     m->taken += m->taken <= MONITOR_SETTLING;
     m->decided = m->decided || deciding;
     for (i = 0; i < CHANNELS; i++) {

@@ -97,7 +97,8 @@ class LearnedRule(Rule):
     likely.
 
     Of a linear observer with a column that is predicted closely, as an estimate that follows from the residuals before,
-    rows that are predicted from a missing one add no evidence, as none of these was learned from.
+    rows that are predicted from a missing one, or from rows before the first one, add no evidence, as none of these was
+    learned from.
 
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
@@ -161,7 +162,8 @@ class LearnedRule(Rule):
         missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
         for _ in range(min(max(missing, 0), max(AGES))):
             state = self._added(state, None)
-        if missing > 0 and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
+        follows_nothing = missing > 0 or state.last is None
+        if follows_nothing and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
             state = state._replace(waiting=self._model.order)
         state = state._replace(last=sample.time, taken=state.taken + 1, decided=int(state.decided or sample.deciding))
         state = self._scored(state, sample.observation, max(missing, 0))
