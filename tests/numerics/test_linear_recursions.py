@@ -38,3 +38,14 @@ def test_impulse_responses_are_powers(steps: int) -> None:
     assert responses.shape == (steps, 1, 2)
     for k, response in enumerate(responses):
         np.testing.assert_allclose(response, c @ np.linalg.matrix_power(a, k) @ b, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(0, 2), (2, 0), (1, 1)])
+def test_impulse_responses_of_no_signals_and_beside_a_mode_that_overflows(inputs: int, outputs: int) -> None:
+    """A mode that no input reaches makes rows overflow, which it does not make of the responses."""
+    a, b, c = np.diag([0.5, 1e3]), np.eye(2, inputs), np.ones((outputs, 2))
+    responses = impulse_responses(a, b[:, :1] if inputs == 1 else 0.0 * b, c, 600)
+    assert responses.shape == (600, outputs, inputs)
+    assert np.all(np.isfinite(responses))
+    if inputs == outputs == 1:
+        np.testing.assert_allclose(responses[:, 0, 0], 0.5 ** np.arange(600), rtol=1e-12, atol=0.0)

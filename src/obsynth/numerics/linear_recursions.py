@@ -56,7 +56,9 @@ def _driven_in_blocks(powers: Sequence[FloatArray], start: FloatArray, drive: Fl
 
 
 def impulse_responses(a: FloatArray, b: FloatArray, c: FloatArray, steps: int) -> FloatArray:
-    """Return ``c a^k b (steps, rows, columns)`` for ``k = 0 ... steps - 1``; not finite where the states overflow."""
+    """Return ``c a^k b (steps, rows, columns)`` for ``k = 0 ... steps - 1``; not finite where the states overflow.
+
+    As ``(c a^(i w)) (a^j b)``, one product for all steps: each costs as many rows as there are outputs, not states."""
     width = isqrt(steps)
     with np.errstate(over="ignore", invalid="ignore"):
         block = [b]
@@ -65,8 +67,21 @@ def impulse_responses(a: FloatArray, b: FloatArray, c: FloatArray, steps: int) -
         leap = np.linalg.matrix_power(a, len(block))
         if not np.all(np.isfinite(leap)):
             block, leap = [b], a
-        states, responses = np.stack(block), []
-        for _ in range(max(-(-steps // len(states)), 1)):
-            responses.append(c @ states)
-            states = leap @ states
+        rows = [c]
+        for _ in range(-(-steps // len(block)) - 1):
+            rows.append(rows[-1] @ leap)
+        products = np.concatenate(rows) @ np.concatenate(block, axis=1)
+        if not np.all(np.isfinite(products)):
+            # Rows may overflow by what no input reaches.
+            return _responses_of_states(np.stack(block), leap, c, steps)
+    parts = products.reshape(len(rows), len(c), len(block), b.shape[1])
+    return parts.swapaxes(1, 2).reshape(len(rows) * len(block), len(c), b.shape[1])[:steps]
+
+
+def _responses_of_states(states: FloatArray, leap: FloatArray, c: FloatArray, steps: int) -> FloatArray:
+    """Return the responses from those of the first states ``(width, n, columns)``, so many steps at once."""
+    responses = []
+    for _ in range(max(-(-steps // len(states)), 1)):
+        responses.append(c @ states)
+        states = leap @ states
     return np.concatenate(responses)[:steps]
