@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.plants.descriptor import MOST_STORED_STATES, DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, reduced_family, sums_of_bounds
@@ -84,6 +84,7 @@ def continuous_behind(plant: DescriptorSystem) -> DescriptorSystem | None:
     return smooth if same else None
 
 
+@remembered
 def moving_columns(plant: DescriptorSystem, behind: DescriptorSystem | None = None) -> MovingColumns | None:
     """Return what disturbances of any time course put into the states in a sample; ``None`` where that is Bd d.
 
