@@ -29,7 +29,7 @@ def test_the_table_names_every_signal(capsys: pytest.CaptureFixture[str]) -> Non
     assert main(["simulate", "--system", WANG, "--quiet"]) == 0
     printed = capsys.readouterr().out
     assert "301 samples, 300 s" in printed
-    assert "errors from 4 s on, when the start no longer shows" in printed
+    assert "errors from 4 s on, when less than 1 % of the start is left" in printed
     for name in ("actuator 1", "actuator 2", "x4"):
         assert name in printed
 

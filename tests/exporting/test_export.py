@@ -266,7 +266,7 @@ def test_a_sample_that_is_not_finite_leaves_the_c_observer_alone(sampled, tmp_pa
         ("sampled", "a", None, "a has no suffix: use one of .mat"),
         ("sampled", "nowhere/a.mat", None, "cannot be written"),
         ("sampled", "a.mat", 0.1, "sampled already"),
-        ("continuous", "a.c", None, "continuous in time: give the sample time"),
+        ("continuous", "a.c", None, r"give the sample time \(sample_time, --sample-time\)"),
         ("continuous", "a.c", -1.0, "dt is -1"),
     ],
 )

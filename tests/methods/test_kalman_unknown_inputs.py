@@ -91,7 +91,8 @@ def test_the_condition_names_what_is_missing():
     given = plant(rng, direct=0, ny=1)
     with pytest.raises(obsynth.PreconditionError) as caught:
         obsynth.descriptor_kalman(given)
-    assert caught.value.condition == "rank [E; C]"
+    assert caught.value.condition == "rank [N E; C]"  # E is the identity: [E; C] has full rank
+    assert "(N combines the equations to those without unknown inputs)" in str(caught.value)
 
 
 def test_a_given_covariance_is_that_of_all_equations():

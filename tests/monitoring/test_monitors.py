@@ -466,3 +466,28 @@ def test_no_start_within_its_bound_passes_the_window_threshold_where_powers_of_t
         assert worst <= bound
         # Up to 6e-4 are lost; what may be, summed up without signs, is 1.1 % on one processor.
         assert bound == pytest.approx(worst, rel=5e-2)
+
+
+@pytest.mark.parametrize("kind", ["pointwise", "window"])
+def test_a_disturbance_of_the_scenario_that_begins_late_is_within_its_bounds(kind: str) -> None:
+    """Bounds were those of the first samples, in which an error at the start decays: zero for what begins later, and a
+    healthy plant was in alarm by a threshold that is "never passed without a fault"."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5, 0.1], [0.0, 0.6]],
+        C=np.eye(2),
+        Bf=[[1.0], [0.0]],
+        Bd=[[0.5], [1.0]],
+        dt=1.0,
+        sensor_noise={"y1": 0.01, "y2": 0.01},
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    late = obsynth.Scenario(horizon=500, noise=1, disturbances={"d1": obsynth.Step(size=2.0, start=400.0)})
+    monitor = obsynth.online_monitor(design, kind, scenario=late, noise_bound=3)
+    assert "with d1 within 2," in monitor.statement
+    x, rows = np.zeros(2), []
+    for k in range(500):
+        rows.append(x)
+        x = plant.A @ x + plant.Bd[:, 0] * (2.0 if k >= 400 else 0.0)
+    y1, y2 = np.array(rows).T
+    run = obsynth.run_on_data(design, {"time": np.arange(500.0), "y1": y1, "y2": y2}, monitor=monitor)
+    assert not run.alarms

@@ -14,10 +14,24 @@ from hypothesis import strategies as st
 from test_export import through_c
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.plants.dead_times import seconds_of
 from obsynth.results.gain_set_writing import digest_of
 
 MATRICES = {"A": [[-1.0, 0.5], [0.0, -2.0]], "B": [[0.0], [1.0]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]]}
+
+SAMPLED_SPEC = """schema_version: 1
+name: late
+plant:
+  dt: 0
+  A: [[-1.0, 0.5], [0.0, -2.0]]
+  B: [[0.0], [1.0]]
+  C: [[1, 0], [0, 1]]
+  Bf: [[1], [0]]
+  delays: {u1: 0.25, y2: 100 ms}
+  transform: {sample_time: 0.1}
+method: {id: functional-filter}
+"""
 
 
 def delayed(**changes):
@@ -433,3 +447,16 @@ def test_paths_with_delays_of_their_own_as_inputs_of_the_same_values() -> None:
         risen = 1.0 - np.exp(-np.maximum(k - late, 0.0) / times)
         np.testing.assert_allclose(sampled.C @ x, (gains * risen) @ [1.0, 0.5], rtol=1e-9, atol=1e-12)
         x = np.linalg.solve(sampled.E, sampled.A @ x + sampled.B @ u)
+
+
+def test_check_takes_a_spec_whose_transformation_samples_the_delays(tmp_path, capsys):
+    """It refused what ``design`` takes, and named as the remedy the transformation that the spec has."""
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(SAMPLED_SPEC)
+    assert main(["check", "-v", "--system", str(spec)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "functional-filter: all conditions hold" in printed
+    assert "as written without delays" in printed
+    assert main(["check", "--system", str(spec), "--json"]) == 0
+    structure = json.loads(capsys.readouterr().out)["structure"]
+    assert set(structure) == {"as_written_without_delays", "as_the_method_sees_it"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from dae_plants import DESIGNS, ROD, diode, exchanger, pendulum
 from ruamel.yaml import YAML
 
+import obsynth
 from obsynth import (
     DAEModel,
     PreconditionError,
@@ -197,8 +199,30 @@ def test_a_model_without_units_and_one_that_is_not_defined_where_the_search_ends
     linear = linearise(model, given={"h": 4.0}, free=["inflow"])
     assert linear.operating_point["inflow"] == pytest.approx(2.0)
     np.testing.assert_allclose(linear.A, [[0.0, -1.0], [0.25, -1.0]], atol=1e-12)
-    with pytest.raises(PreconditionError, match="'valve' are not defined where the search ends"):
+    with pytest.raises(PreconditionError, match="the equation 'valve' has no value where the search ends"):
         linearise(model, given={"h": -4.0}, free=["inflow"])
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("asin(h)", "'tank' has no finite derivative at the nominal values (a root at zero, asin or acos at 1 or -1?)"),
+        ("sqrt(h - 1)", "'tank' has no finite derivative at the nominal values (a root at zero, asin or"),
+        ("log(h - 1)", "'tank' has no value at the nominal values (a root of a negative number, a logarithm of zero"),
+    ],
+)
+def test_equations_without_value_or_derivative_at_the_start_are_named_with_what_may_be_the_reason(formula, words):
+    model = DAEModel(
+        {"tank": f"der(h) = q - {formula} - leak", "pipe": "der(w) = h - w"}, {"level": "w"},
+        states={"h": 1.0, "w": 1.0}, inputs={"q": 1.5}, parameters={"leak": 0.0},
+    )  # fmt: skip
+    with pytest.raises(SpecError, match=re.escape(words)):
+        linearise(model)
+    # Not "singular for every dt" and "not independent": nothing is known of the index there.
+    with pytest.raises(PreconditionError, match=re.escape(words)) as caught:
+        obsynth.design(model, "dae-adaptive-observer", dt=0.1, Q=1e-4, R=1e-4, initial_parameter_covariance=[[1.0]])
+    assert caught.value.condition == "index"
+    assert "independent" not in str(caught.value)
 
 
 TANK = """schema_version: 1

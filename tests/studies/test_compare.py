@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -272,6 +273,10 @@ def test_deviations_for_noise_that_nobody_states_say_so() -> None:
         plant = obsynth.DescriptorSystem(**parts, sensor_noise=noise)
         found = obsynth.compare(plant, methods=["functional-filter"], runs=2)
         assert (assumed in found.meanings()) == (noise is None)
+    plant = obsynth.DescriptorSystem(**parts, sensor_noise={"y1": 0.1, "y2": 0.1})
+    recursion = replace(found.methods[0], design=obsynth.design(plant, "adaptive-observer"))
+    both = replace(found, methods=(*found.methods, recursion))
+    assert assumed not in both.meanings()  # the recursion keeps its covariances, and its plant has no noise
 
 
 def test_a_bound_that_is_rounding_is_shown_as_zero() -> None:

@@ -106,3 +106,25 @@ def test_the_command_line_says_which_sensor_finds_a_fault(capsys: pytest.Capture
     assert "the least is 0.037" in " ".join(capsys.readouterr().err.split())
     assert main([*asked, "--below", "0.04"]) == 2
     assert "--below is for --goal threshold" in capsys.readouterr().err
+
+
+def test_the_bound_of_a_scenario_counts_disturbances_that_begin_after_the_observer_has_settled() -> None:
+    """``evaluate`` said "Fault-free ... |estimate of f1| <= 0.048" where the scenario itself reached 1."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5, 0.1], [0.0, 0.6]],
+        C=np.eye(2),
+        Bf=[[1.0], [0.0]],
+        Bd=[[0.5], [1.0]],
+        dt=1.0,
+        sensor_noise={"y1": 0.01, "y2": 0.01},
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    late = obsynth.Scenario(horizon=500, noise=1, disturbances={"d1": obsynth.Step(size=2.0, start=400.0)})
+    ((bound, _),) = design_beside_least(design, late).values()
+    x, outputs = np.zeros(2), []
+    for k in range(500):
+        outputs.append(x)
+        x = plant.A @ x + plant.Bd[:, 0] * (2.0 if k >= 400 else 0.0)
+    largest = np.abs(design.observer.run(np.array(outputs)).faults).max()
+    assert largest > 0.9
+    assert bound >= largest

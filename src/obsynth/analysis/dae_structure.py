@@ -13,6 +13,7 @@ from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
 from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_checks import without_value
 from obsynth.plants.dae_functions import DAEFunctions
 from obsynth.plants.dae_signals import checked_inputs, finite_vector, step_length
 from obsynth.plants.implicit_step import ImplicitStep
@@ -244,6 +245,7 @@ class IndexReport:
     conditions: tuple[float, ...]
     equations: tuple[str, ...]
     states: tuple[str, ...]
+    undefined: str = ""  # which equations have no value or derivative at the point; the index is 0 then
 
 
 def index_report(
@@ -259,7 +261,12 @@ def index_report(
     u = model.nominal_input if u is None else u
     theta = model.nominal_parameters if theta is None else theta
     functions = DAEFunctions(model)
-    jacobians = (functions.residual(x, x, u, theta, np.array([factor * dt]))[1] for factor in SHORTENINGS)
+    residuals = [functions.residual(x, x, u, theta, np.array([factor * dt])) for factor in SHORTENINGS]
+    names = model.equation_names * (len(residuals[0][1]) // model.nx)  # those of each stage
+    bad, undefined = without_value(names, residuals[0][0][:, 0], residuals[0][1], where="at the nominal values")
+    if undefined:
+        return IndexReport(0, (np.inf, np.inf), tuple(bad), (), undefined)
+    jacobians = [jacobian for _, jacobian in residuals]
     matrices = [ScaledMatrix.of(jacobian, model.state_scales) for jacobian in jacobians]
     conditions = tuple(matrix.condition for matrix in matrices)
     if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
@@ -267,8 +274,8 @@ def index_report(
     decades = np.log10(SHORTENINGS[0] / SHORTENINGS[-1])
     slope = np.log10(min(conditions[-1], 1.0 / np.finfo(np.float64).eps) / conditions[0]) / decades
     index = 1 + max(0, round(float(slope)))
-    names = ((), ()) if index == 1 else involved(model, matrices[-1].matrix)
-    return IndexReport(index, conditions, *names)
+    who = ((), ()) if index == 1 else involved(model, matrices[-1].matrix)
+    return IndexReport(index, conditions, *who)
 
 
 def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -101,7 +101,10 @@ def run_check(options: argparse.Namespace) -> int:
         except (SolverError, MemoryError) as error:  # the methods are asked all the same
             not_known = f"What can be diagnosed is not known. {failure_of(error) or error}"
     if spec.transformation is not None:
-        structures = {"as written": obsynth.analyse_structure(spec.transformation.source), **structures}
+        source, name = spec.transformation.source, "as written"
+        if getattr(source, "delays", None):  # a plant with delays has no pencil
+            source, name = source.replace(delays=None), "as written without delays"
+        structures = {name: obsynth.analyse_structure(source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
     methods = obsynth.check(spec.plant, {spec.method: spec.options})
     own = methods.values() if spec.method == AUTO else [methods[spec.method]]

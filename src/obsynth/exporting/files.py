@@ -270,7 +270,8 @@ def _write_linear(
         return _write_window(realisation, target, options.numbers)
     if realisation.observer.dt == 0.0:
         raise SpecError(
-            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
+            "The observer is continuous in time: give the sample time (sample_time, --sample-time), in seconds, for C.",
+            path="sample_time",
         )
     bounds = (
         None

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _OF_STATES_AS_WRITTEN = ("Q", "initial_state", "initial_covariance", "state_bounds")
 
 #: Conditions that every state is dynamic or measured, which no observer needs.
-_DYNAMIC_OR_MEASURED = ("rank [E; C]", "rank [E 0; 0 0; C Df]")
+_DYNAMIC_OR_MEASURED = ("rank [E; C]", "rank [N E; C]", "rank [E 0; 0 0; C Df]")
 
 
 @dataclass(frozen=True, eq=False)

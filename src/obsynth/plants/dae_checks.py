@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -9,9 +10,32 @@ import numpy as np
 
 from obsynth.errors import SpecError, counted
 from obsynth.numerics import lazy_casadi as ca
+from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.checking import Problems
 from obsynth.plants.dae_equations import DAESymbols, symbols_of
 from obsynth.plants.dae_fields import DAEFields
+
+#: Where an expression has no value, and where it has one but no finite derivative.
+_NO_VALUE = "a root of a negative number, a logarithm of zero or less, asin or acos beyond 1, a division by zero?"
+_NO_DERIVATIVE = "a root at zero, asin or acos at 1 or -1?"
+
+
+def without_value(
+    names: Sequence[str], residual: FloatArray, jacobian: FloatArray, *, where: str
+) -> tuple[list[str], str]:
+    """Return the equations without a value, where all have one those without finite derivatives, and that in words.
+
+    ``names``: of the rows of ``residual (n,)`` and ``jacobian (n, m)``; ``where`` they were asked, such as "at the
+    nominal values".  Nothing where all is finite.
+    """
+    has_value, is_smooth = np.isfinite(residual), np.isfinite(jacobian).all(axis=1)
+    what, reasons = ("no finite derivative", _NO_DERIVATIVE) if has_value.all() else ("no value", _NO_VALUE)
+    rows: list[bool] = np.logical_not(is_smooth if has_value.all() else has_value).tolist()
+    bad = list(dict.fromkeys(name for name, is_bad in zip(names, rows, strict=True) if is_bad))
+    if not bad:
+        return [], ""
+    subject = f"the equation {bad[0]!r} has" if len(bad) == 1 else f"the equations {', '.join(map(repr, bad))} have"
+    return bad, f"{subject} {what} {where} ({reasons})"
 
 
 def check_distinct(model: DAEFields) -> None:

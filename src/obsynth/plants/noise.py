@@ -52,7 +52,7 @@ def require_noise(noise_bound: float | None, *, noisy: bool) -> None:
         raise SpecError(
             "noise_bound is a number of standard deviations, but no noise is stated that reaches the monitored "
             "signals, so there is nothing to multiply: state the noise of the sensors (sensor_noise of the plant, or "
-            "Bw and Dw), or leave noise_bound out.",
+            "Bw and Dw, and noise: 1 in a scenario), or leave noise_bound out.",
             path="noise_bound",
         )
 

@@ -43,6 +43,8 @@ def simulation_report(
     file: str | None = None,
 ) -> None:
     """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others."""
+    from obsynth.simulation.benches import WARM_UP_SHARE
+
     summary = simulation.summary()
     console.print(Text(f"{name}: {summary['samples']} samples, {simulation.time[-1]:g} s", style="bold"))
     console.print()
@@ -67,7 +69,7 @@ def simulation_report(
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
             remark = "the initial-condition response has not settled: errors of the whole record"
         elif linear:
-            remark = f"errors from {duration(end)} on, when the start no longer shows"
+            remark = f"errors from {duration(end)} on, when less than {WARM_UP_SHARE * 100:g} % of the start is left"
         print_section(console, f"{title} ({remark})", table)
     for note in summary["notes"]:
         console.print(Text(note))

@@ -287,7 +287,7 @@ def side_by_side(
     )
     logged = None if log is None else log.record(sampled, settings.input_delay)
     limit = settings.within if settings.within is not None else settling_time(plant)
-    bounds = largest_disturbances(trial, sampled.disturbance_names, steps, dt)
+    bounds = largest_disturbances(trial, sampled.disturbance_names, dt)
     compared = _sized(
         [
             _compared(entry, sampled, faulty, healthy, logged, loop, limit, settings.false_alarms, bounds)

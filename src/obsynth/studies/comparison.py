@@ -230,11 +230,13 @@ class Comparison:
     @property
     def _of_assumed_noise(self) -> str:
         """Which noise deviations are for where the plant states none, in a sentence; empty where it does."""
+        # Methods that have covariances of their own keep a plant without noise, which tells nothing of the one given.
         plants = [entry.design.plant for entry in self.methods if entry.design is not None]
-        stated = (
-            isinstance(plant, DescriptorSystem) and plant.nw and not is_noise_assumed(plant.noise_names)
+        stated = [
+            plant.nw and not is_noise_assumed(plant.noise_names)
             for plant in plants
-        )
+            if isinstance(plant, DescriptorSystem)
+        ]
         if all(stated):
             return ""
         return "The plant states no noise: deviations are for white noise of deviation 1 on every output."

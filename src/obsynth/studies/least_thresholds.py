@@ -210,7 +210,7 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
         steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_RESPONSE_STEPS))
         (steps, feedback), radius = response_steps(sampled, observer, steps)
         impulses, _ = step_responses(sampled, observer, steps, feedback)
-        bounds = largest_disturbances(scenario, sampled.disturbance_names, steps, plant.dt)
+        bounds = largest_disturbances(scenario, sampled.disturbance_names, plant.dt)
         moving = moving_gains(sampled, observer, steps, feedback)
         pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds, radius, moving)
     except ObsynthError:

@@ -13,7 +13,7 @@ Constant parameters of a plant (its faults) enter the equations that are left by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,10 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 #: Prior deviation of an unknown input at the first sample, relative to the one that moves a state by its own prior
 #: deviation: as good as none, and its square far from overflow.
 UNKNOWN_INPUT_PRIOR = 1e4
+
+#: How names of conditions on E begin, and how they do where unknown inputs were removed with equations.
+_GIVEN, _LEFT = "rank [E; C", "rank [N E; C"
+_WHAT_IS_LEFT = "N combines the equations to those without unknown inputs"
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,13 +188,23 @@ def kalman_conditions(
     early: bool = False,
 ) -> tuple[Condition, ...]:
     """Return the existence conditions, those of the ``parameters`` too; the list ends at the first failure."""
-    if isinstance(plant, DescriptorSystem) and plant.nd:
-        try:
-            plant = without_unknown_inputs(plant).plant
-        except SpecError:
-            # What it is says why it is not taken.
-            plant = plant.replace(Bd=None, Dd=None, disturbance_names=None)
-    return tuple(recursive_conditions(plant, parameters=parameters, literal=literal, early=early))
+    if not isinstance(plant, DescriptorSystem) or not plant.nd:
+        return tuple(recursive_conditions(plant, parameters=parameters, literal=literal, early=early))
+    try:
+        reduced: DescriptorSystem | TimeVaryingDescriptorSystem = without_unknown_inputs(plant).plant
+    except SpecError:
+        # What it is says why it is not taken.
+        reduced = plant.replace(Bd=None, Dd=None, disturbance_names=None)
+    found = recursive_conditions(reduced, parameters=parameters, literal=literal, early=early)
+    return tuple(map(_of_equations_left, found))
+
+
+def _of_equations_left(condition: Condition) -> Condition:
+    """Return a condition on ``E`` as one on ``N E``: the E of the plant as given may have full rank."""
+    if not condition.name.startswith(_GIVEN):
+        return condition
+    name, claim = (text.replace(_GIVEN, _LEFT) for text in (condition.name, condition.claim))
+    return replace(condition, name=name, claim=f"{claim} ({_WHAT_IS_LEFT})")
 
 
 def with_stated_noise(

@@ -35,7 +35,9 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
     report = index_report(model, dt)
     growth = ", then ".join(f"{value:.3g}" for value in report.conditions)
     detail = f"the condition of dF/dx' / dt + dF/dx is {growth} when dt falls to a tenth"
-    if report.index == 0:
+    if report.undefined:
+        detail = f"{report.undefined}; state other nominal values"
+    elif report.index == 0:
         detail += (
             f": it is singular for every dt; the equations {', '.join(map(repr, report.equations))} are not independent"
         )

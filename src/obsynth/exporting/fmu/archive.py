@@ -94,7 +94,9 @@ def _contents(
     realisation = Realisation.of(design, sample_time)
     if realisation.observer.dt == 0.0:
         raise SpecError(
-            "The observer is continuous in time: give the sample time, in seconds, for an FMU.", path="sample_time"
+            "The observer is continuous in time: give the sample time (sample_time, --sample-time), in seconds, for an "
+            "FMU.",
+            path="sample_time",
         )
     alarms = linear_alarms(realisation, thresholds, warm_up, monitor)
     texts = source_text(realisation, PREFIX, header, alarms), header_text(realisation, PREFIX, alarms)

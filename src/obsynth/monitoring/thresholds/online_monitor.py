@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,12 @@ from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, STATEMENTS, Mon
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.region_bounds import region_bound
-from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.monitoring.thresholds.residual_model import (
+    ResidualModel,
+    largest_disturbances,
+    residual_model,
+    watches_estimates,
+)
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of, require_no_region
 from obsynth.monitoring.thresholds.residual_norm_bounds import (
     samples_of,
@@ -458,7 +464,10 @@ def _endless_model(
         observer_state=None,
         stabilise=False,
     )
-    return residual_model(design, expected, endless=True, estimates=estimates), dt
+    model = residual_model(design, expected, endless=True, estimates=estimates)
+    if scenario is None:
+        return model, dt
+    return replace(model, bounds=largest_disturbances(scenario, plant.disturbance_names, dt)), dt
 
 
 def _whitened(

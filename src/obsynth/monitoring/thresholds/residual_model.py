@@ -24,7 +24,7 @@ from obsynth.observers.linear.sampled import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.profiles import Additive, Random
+from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, Random
 from obsynth.simulation.scenario import Scenario, observer_start
 from obsynth.simulation.signals import ScenarioSignals, resolve
 from obsynth.verification.error_system import ErrorModel
@@ -242,9 +242,12 @@ def residual_model(
     )
 
 
-def largest_disturbances(scenario: Scenario, names: tuple[str, ...], steps: int, dt: float) -> FloatArray:
-    """Return the largest absolute value of each disturbance of a scenario; infinite where it has none."""
-    return _disturbances(scenario, names, steps, dt)[0]
+def largest_disturbances(scenario: Scenario, names: tuple[str, ...], dt: float) -> FloatArray:
+    """Return the largest absolute value of each disturbance ``(nd,)`` in a whole scenario; infinite where it has none.
+
+    Whoever looks at fewer samples has the bounds of all: a disturbance may begin, or grow, after an observer settled.
+    """
+    return _disturbances(scenario, names, int(scenario.horizon / dt + SAMPLE_SLACK) + 1, dt)[0]
 
 
 def _disturbances(

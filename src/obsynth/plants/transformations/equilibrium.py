@@ -13,6 +13,7 @@ from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
 from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_checks import without_value
 from obsynth.plants.dae_functions import local_equations
 from obsynth.plants.signal_names import index_of
 
@@ -109,10 +110,11 @@ class _Problem:
         freed = np.abs(begin[len(self.states) :])
         self.sizes = np.concatenate([model.state_scales[self.states], np.where(freed > 0.0, freed, 1.0)])
         self.begin: FloatArray = np.asarray(begin / self.sizes)
-        jacobian = self.raw(self.begin)[1]
+        residual, jacobian = self.raw(self.begin)
         if not np.isfinite(jacobian).all():
+            _, undefined = without_value(self.rows, residual, jacobian, where="at the nominal values")
             raise SpecError(
-                "The model is not defined at its nominal values: give other ones by start or given.", path="start"
+                f"There is no point to begin at: {undefined}. Give other values by start or given.", path="start"
             )
         self.weights = _row_weights(jacobian)
 
@@ -182,14 +184,9 @@ class _Problem:
 
     def undefined(self, residual: FloatArray, jacobian: FloatArray) -> PreconditionError:
         """Return the refusal of a place where equations have no value."""
-        bad = [
-            name
-            for name, value, row in zip(self.rows, residual, jacobian, strict=True)
-            if not (np.isfinite(value) and np.isfinite(row).all())
-        ]
+        bad, undefined = without_value(self.rows, residual, jacobian, where="where the search ends")
         return PreconditionError(
-            f"There is no equilibrium: the equations {', '.join(map(repr, bad))} are not defined where the search ends "
-            "(a root or a logarithm of a negative number, a division by zero?). Give other values, or a start.",
+            f"There is no equilibrium: {undefined}. Give other values, or a start.",
             condition="no-equilibrium",
             signals=bad,
         )
