@@ -286,6 +286,10 @@ def learned() -> obsynth.types.LearnedThresholds:
 @pytest.mark.long
 def test_normal_rows_are_quiet_and_a_fault_is_named() -> None:
     monitor = obsynth.online_monitor(heated(), "learned", normal=learned())
+    same = obsynth.online_monitor(heated(), learned())
+    assert (same.kind, same.statement) == (monitor.kind, monitor.statement)
+    with pytest.raises(obsynth.SpecError, match="leave normal out"):
+        obsynth.online_monitor(heated(), learned(), normal=learned())
     assert learned().holds
     quiet = obsynth.run_on_data(heated(), log(5_000, 1), monitor=monitor).table
     assert quiet is not None

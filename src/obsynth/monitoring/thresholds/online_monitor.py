@@ -87,7 +87,7 @@ _REGULAR = "; no row is further than {dt} s from the last"
 @arguments_checked
 def online_monitor(
     design: ObserverDesign,
-    kind: str = "pointwise",
+    kind: str | LearnedThresholds = "pointwise",
     *,
     scenario: Scenario | None = None,
     disturbance_bounds: Mapping[str, float] | None = None,
@@ -116,7 +116,8 @@ def online_monitor(
     kind : {"pointwise", "paper", "window", "chi-square", "cusum", "nis", "learned"}, optional
         The first three for linear designs, as for `obsynth.monitor`; ``nis`` for the others (all that the model does
         not explain), where ``chi-square`` is on the parameters against their nominal values.  ``learned``, for every
-        design: from rows without faults, whatever the model assumes of noise.
+        design: from rows without faults, whatever the model assumes of noise.  Thresholds that were learned may stand
+        here themselves: `online_monitor(design, thresholds)`.
     scenario : Scenario, optional
         Linear designs: whose disturbances and noise are those to be expected; its length, start, inputs and faults do
         not count.  Without one, the noise is the plant's own, once, and disturbances need bounds.
@@ -189,6 +190,10 @@ def online_monitor(
     'pointwise'
     """
     require_verified(design, unverified=unverified)
+    if isinstance(kind, LearnedThresholds):
+        if normal is not None:
+            raise SpecError("The thresholds stand in the place of kind: leave normal out.", path="normal")
+        kind, normal = "learned", kind
     recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
     options = {
         "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
