@@ -217,3 +217,25 @@ def test_noise_of_the_plant_may_have_the_name_of_what_is_added() -> None:
         noise_names=("drive of lasting mode 1", "noise y1"),
     )
     assert obsynth.optimal_filter(plant, delay=0).report.passed
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_an_angle_sensor_of_a_cart_with_an_inverted_pendulum(exact: bool) -> None:
+    """No noise drives the plant: neither its pole at zero nor the one that grows, and drives of the one are none of
+    the other.  With the exact fault map the least is known: ``e = M v2 - N v1`` with ``N(p) = M(p) angle / position`` at
+    the growing pole, so that ``|N|_2^2 >= 2 p N(p)^2``."""
+    noise, bandwidth = 1e-3, 1.3
+    pendulum = obsynth.DescriptorSystem(
+        A=[[0, 1, 0, 0], [0, -0.1, -0.98, 0], [0, 0, 0, 1], [0, 0.2, 21.56, 0]], B=[[0], [1], [0], [-2]],
+        C=[[1, 0, 0, 0], [0, 0, 1, 0]], Df=[[0], [1]], Bf=np.zeros((4, 1)), Dw=noise * np.eye(2),
+    )  # fmt: skip
+    design = obsynth.optimal_filter(pendulum, norm="h2", exact=exact, reference={"bandwidth": bandwidth})
+    claims, pole = design.certificate.claims, float(np.max(np.linalg.eigvals(pendulum.A).real))
+    at_pole = bandwidth / (pole + bandwidth) * (pole**2 + 0.1 * pole) / 0.98
+    least = noise * np.sqrt(bandwidth / 2.0 + 2.0 * pole * at_pole**2)
+    assert design.report.passed
+    if exact:
+        assert claims["least_deviation"] == pytest.approx(least, rel=1e-6)
+    assert claims["least_deviation"] <= claims["deviation"] <= 1.01 * claims["least_deviation"] <= 1.011 * least
+    # A constant error of the position is forgot in minutes, not in years.
+    assert np.max(np.linalg.eigvals(design.observer.Az).real) < -1e-3

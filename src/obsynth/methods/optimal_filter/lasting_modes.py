@@ -9,8 +9,11 @@ Riccati equation has a stabilising solution without it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_estimation import STABLE_RADIUS
@@ -68,22 +71,46 @@ def _with_drives(plant: DescriptorSystem, drive: float, name: str, *, grows: boo
 
 
 def _undriven(e: FloatArray, a: FloatArray, noise: FloatArray, discrete: bool, grows: bool | None) -> FloatArray:
-    """Return orthonormal columns that drive every lasting mode which the noise does not: of all, or as it ``grows``."""
+    """Return orthonormal columns that drive every lasting mode which the noise does not: of all, or as it ``grows``.
+
+    Columns of modes that grow drive none of the others that last, nor do those of these drive modes that grow."""
     alpha, beta = scipy.linalg.eigvals(a, e, homogeneous_eigvals=True)
-    finite = np.abs(beta) * INFINITE_EIGENVALUE > np.abs(alpha)
+    finite = _is_finite(alpha, beta)
+    edge = 1.0 - STABLE_RADIUS
+    if not discrete:
+        edge = AXIS_SHARE * float(np.max(np.abs(alpha[finite] / beta[finite]), initial=0.0))
+
+    def lasts(modes: NDArray[np.complex128], grows: bool | None) -> NDArray[np.bool_]:
+        beyond = np.abs(modes) - 1.0 if discrete else modes.real
+        return np.asarray((beyond >= -edge) & ((grows is None) | ((beyond > edge) == bool(grows))))
+
     modes = alpha[finite] / beta[finite]
-    if discrete:
-        beyond, edge = np.abs(modes) - 1.0, 1.0 - STABLE_RADIUS
-    else:
-        beyond, edge = modes.real, AXIS_SHARE * float(np.max(np.abs(modes), initial=0.0))
-    lasting = modes[(beyond >= -edge) & ((grows is None) | ((beyond > edge) == bool(grows)))]
+    lasting = modes[lasts(modes, grows)]
     columns: list[FloatArray] = []
+    lengths = np.linalg.norm(noise, axis=0)
+    directions = noise[:, lengths > 0.0] / lengths[lengths > 0.0]
     for mode in lasting[lasting.imag >= 0.0]:
         vectors = scipy.linalg.null_space((a - mode * e).conj().T, rcond=RANK_TOLERANCE)
         # Older releases of SciPy take no matrix without rows or columns.
-        if vectors.shape[1] and noise.shape[1]:
-            vectors = vectors @ scipy.linalg.null_space(noise.T @ vectors, rcond=RANK_TOLERANCE)
+        if vectors.shape[1] and directions.shape[1]:
+            _, sizes, turned = np.linalg.svd(directions.T @ vectors)
+            vectors = vectors @ turned[int(np.sum(sizes > RANK_TOLERANCE)) :].conj().T
         columns += [vectors.real, vectors.imag] if vectors.shape[1] else []
     if not columns:
         return np.zeros((len(a), 0))
-    return np.asarray(scipy.linalg.orth(np.hstack(columns), rcond=RANK_TOLERANCE))
+    driving = np.hstack(columns)
+    others = 0 if grows is None else int(np.sum(lasts(modes, not grows)))
+    if others:
+
+        def is_other(alpha: NDArray[np.complex128], beta: NDArray[np.float64]) -> NDArray[np.bool_]:
+            found = _is_finite(alpha, beta)
+            found[found] = lasts(alpha[found] / beta[found], not grows)
+            return found
+
+        left = scipy.linalg.ordqz(a.T, e.T, sort=is_other)[5][:, :others]
+        driving = driving - left @ (left.T @ driving)
+    return np.asarray(scipy.linalg.orth(driving, rcond=RANK_TOLERANCE))
+
+
+def _is_finite(alpha: NDArray[np.complex128], beta: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(beta) * INFINITE_EIGENVALUE > np.abs(alpha))
