@@ -222,8 +222,8 @@ def test_noise_of_the_plant_may_have_the_name_of_what_is_added() -> None:
 @pytest.mark.parametrize("exact", [True, False])
 def test_an_angle_sensor_of_a_cart_with_an_inverted_pendulum(exact: bool) -> None:
     """No noise drives the plant: neither its pole at zero nor the one that grows, and drives of the one are none of
-    the other.  With the exact fault map the least is known: ``e = M v2 - N v1`` with ``N(p) = M(p) angle / position`` at
-    the growing pole, so that ``|N|_2^2 >= 2 p N(p)^2``."""
+    the other.  With the exact fault map the least is known: ``e = M v2 - N v1``, where ``N(p) = M(p) angle / position``
+    at the growing pole, so that ``|N|_2^2 >= 2 p N(p)^2``."""
     noise, bandwidth = 1e-3, 1.3
     pendulum = obsynth.DescriptorSystem(
         A=[[0, 1, 0, 0], [0, -0.1, -0.98, 0], [0, 0, 0, 1], [0, 0.2, 21.56, 0]], B=[[0], [1], [0], [-2]],
