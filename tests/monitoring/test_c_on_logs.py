@@ -596,6 +596,23 @@ def test_c_after_gaps_says_what_a_run_says(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("taken_as_verified")
+def test_c_keeps_an_alarm_of_the_start_that_is_larger_than_an_offset_as_a_run_does(tmp_path: Path) -> None:
+    design = obsynth.fault_estimation_filter(in_discrete_time())
+    learned = replace(told(design), logs=1, memory=300.0)
+    monitor = obsynth.online_monitor(design, "learned", normal=learned, sensor_faults=False)
+    small, large = log_of(design), log_of(design)
+    size = float(np.nanmax(np.abs(small["y1"])))
+    small["y1"] += size
+    large["y1"] += 1e4 * size
+    alarms = []
+    for log, out in zip((small, large), rows_in_c(design, monitor, [small, large], tmp_path), strict=True):
+        run = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0, recovered="none")
+        np.testing.assert_allclose(out[:, -2], run.table["statistic"], rtol=1e-9)
+        alarms.append(any("taken for what is usual" in text for text in run.warnings))
+    assert alarms == [True, False]
+
+
+@pytest.mark.usefixtures("taken_as_verified")
 def test_c_raises_levels_where_residuals_swing_as_a_run_does(tmp_path: Path) -> None:
     design = obsynth.fault_estimation_filter(in_discrete_time())
     log = log_of(design)

@@ -166,6 +166,8 @@ def test_a_linear_filter_follows_what_one_log_does_not_tell_from_drifts() -> Non
     off, drift = lines(1, off=4.0), lines(2, rows=ROWS, drift=0.8)
     assert alarmed(before, off)[200:].mean() > 0.9
     assert not alarmed(now, off)[200:].any()
+    # What is larger than offsets are stays an alarm: levels rose by what it reached, and nothing was seen any more.
+    assert alarmed(now, lines(1, rows=400, off=15.0))[200:].all()
     assert alarmed(before, drift).mean() > 0.1
     assert alarmed(now, drift).mean() < 0.02
     step = alarmed(now, lines(3, fault=0.2))

@@ -17,6 +17,7 @@ from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import (
     FOLLOWED_MOST,
     MOST_OF_START,
+    NEARLY_MOST,
     OWN_MOST,
     ROOM_OF_START,
     LearnedRule,
@@ -173,6 +174,7 @@ class LearnedMonitorInC:
             "MONITOR_FOLLOW": usual, "MONITOR_FOLLOW_IN_ALARM": in_alarm, "MONITOR_FOLLOWED_MOST": FOLLOWED_MOST,
             "MONITOR_FOLLOW_LATER": later, "MONITOR_FOLLOW_LATER_IN_ALARM": later_in_alarm,
             "MONITOR_FAULTS_SLOWER": FAULTS_SLOWER, "MONITOR_OWN_MOST": OWN_MOST,
+            "MONITOR_NEARLY_MOST": NEARLY_MOST,
             "MONITOR_ROOM": ROOM_OF_START, "MONITOR_MOST_OF_START": MOST_OF_START,
             "MONITOR_SWING": SWING, "MONITOR_LEAST_SWINGS": LEAST_SWINGS, "MONITOR_SWING_ROOM": SWING_ROOM,
             "MONITOR_SWING_KEPT": 1.0 - 1.0 / SWING_MEMORY, "MONITOR_ROW_KEPT": 1.0 - 1.0 / ROW_MEMORY,

@@ -431,6 +431,12 @@ static void monitor_own(PREFIX_monitor *m, const REAL *theta, const REAL *covari
     if (!m->alarmed || !is_finite || (m->begun != MONITOR_OWN && m->begun != MONITOR_OWN_LATER)) {
         return;
     }
+    /* What is larger than any offset stays an alarm. */
+    for (i = 0; i < CHANNELS; i++) {
+        if (ABS(m->own[i] / (REAL)m->begun) > MONITOR_NEARLY_MOST * MONITOR_OWN_MOST) {
+            return;
+        }
+    }
     for (i = 0; i < CHANNELS; i++) {
         m->slow[i] = m->own[i] / (REAL)m->begun;
     }

@@ -40,8 +40,8 @@ NOTHING = read_only(np.zeros(0))
 FOLLOWED_MOST = 3.0
 
 #: Deviations of a row that count in the means of a start, at most: one wrong sample moves them by a tenth, and an
-#: offset that is larger stays an alarm.
-OWN_MOST = 10.0
+#: offset that is larger, whose mean comes to nearly as much, stays an alarm.
+OWN_MOST, NEARLY_MOST = 10.0, 0.9
 
 #: Where more than this share of a start that is taken for usual was in alarm it stood nearly from the first row on, and
 #: levels rise by so many times what statistics were there (the mean of their roots, so that wrong samples say little):
@@ -321,6 +321,8 @@ class LearnedRule(Rule):
         if begun not in OWN_ROWS or not state.alarmed or not np.isfinite(own).all():
             return state
         slow, centres = np.split(own / begun, [len(white)])
+        if np.abs(slow).max(initial=0.0) > NEARLY_MOST * OWN_MOST:
+            return state
         room = ROOM_OF_START * (state.roots / state.stood) ** 2 if state.stood > MOST_OF_START * begun else 1.0
         return state._replace(
             slow=slow, centres=centres, room=max(state.room, room), white=np.zeros_like(state.white),
