@@ -97,11 +97,23 @@ def test_one_vertex_has_rounding_alone_beside_it() -> None:
         (ErrorPolytope([[[-1.0]]], [[1.0]], B=[[1.0]], D=[[0.0]], dt=0.0), 0.1, "Inputs of the errors"),
         (ErrorPolytope([[[-1.0]]], [[1.0]], dt=0.0), 0.0, "dt"),
         (ErrorPolytope([[[-1.0]]], [[1.0]], dt=0.0), float("nan"), "dt"),
+        (ErrorPolytope([[[900.0]], [[901.0]]], [[1.0]], dt=0.0), 1.0, "smaller dt"),
+        (ErrorPolytope([[[500.0]], [[501.0]]], [[1.0]], dt=0.0), 1.0, "smaller dt"),
+        (ErrorPolytope([[[-1e200]], [[-1.0]]], [[1.0]], dt=0.0), 1.0, "smaller dt"),
     ],
 )
 def test_what_has_no_samples_here_is_refused(errors: ErrorPolytope, dt: float, told: str) -> None:
     with pytest.raises(SpecError, match=told):
         sampled_polytope(errors, dt)
+
+
+def test_a_drift_without_a_finite_bound_is_refused() -> None:
+    growing = ErrorPolytope([[[900.0]], [[901.0]]], [[1.0]], dt=0.0)
+    assert drift_within_samples(growing, 1e-3, 1.0) < 1e-5
+    with pytest.raises(SpecError, match="smaller dt"):
+        drift_within_samples(growing, 1.0, 1.0)
+    with pytest.raises(SpecError, match="finite square"):
+        ErrorPolytope([[[0.5]]], [[1.0]], ball=1e200)
 
 
 @pytest.mark.long

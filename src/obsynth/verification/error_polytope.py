@@ -90,8 +90,8 @@ class ErrorPolytope:
             raise SpecError(
                 f"differential is {self.differential}: give 1 to {n}, in continuous time.", path="differential"
             )
-        if not (np.isfinite(self.ball) and self.ball >= 0.0):
-            raise SpecError("ball must be a finite number, 0 or more.", path="ball")
+        if not (np.isfinite(self.ball * self.ball) and self.ball >= 0.0):
+            raise SpecError("ball must be a number with a finite square, 0 or more.", path="ball")
         if self.ball and self.differential not in (None, n):
             raise SpecError("A remainder beside A is for errors that are all differential.", path="ball")
         for name, matrices in matrices_of.items():

@@ -49,7 +49,8 @@ def sampled_polytope(errors: ErrorPolytope, dt: float) -> ErrorPolytope:
     Raises
     ------
     SpecError
-        The system is sampled, has algebraic errors or inputs, or dt is not positive.
+        The system is sampled, has algebraic errors or inputs, dt is not positive, or errors grow so much within a
+        sample that nothing finite bounds the remainder.
 
     Examples
     --------
@@ -68,12 +69,23 @@ def sampled_polytope(errors: ErrorPolytope, dt: float) -> ErrorPolytope:
             "Inputs of the errors, and outputs that change, are not sampled here: give A at the vertices, and one C.",
             path="errors",
         )
-    made = [affine_exponential(_times(dt, matrix)) for matrix in errors.A]
-    rounding = max(float(np.linalg.norm(matrix.radius)) for matrix in made)
-    diameter = max(float(np.linalg.norm(one - other)) for one in errors.A for other in errors.A)
-    share = (1.0 - 1.0 / errors.count) / 4.0
-    ball = (dt * diameter) ** 2 * share * _growth(errors, dt) * _ROOM + rounding * _ROOM
+    # What overflows has no finite bound, and is refused.
+    with np.errstate(over="ignore", invalid="ignore"):
+        missed = _missed_of_means(errors, dt)
+        _require_finite_square(missed, dt)
+        made = [affine_exponential(_times(dt, matrix)) for matrix in errors.A]
+        rounding = max(float(np.linalg.norm(matrix.radius)) for matrix in made)
+        ball = missed + rounding * _ROOM
+        largest = max(float(np.linalg.norm(matrix.center)) for matrix in made)
+    _require_finite_square(ball + largest, dt)
     return ErrorPolytope([matrix.center for matrix in made], errors.C[0], Cz=list(errors.Cz), dt=dt, ball=ball)
+
+
+def _missed_of_means(errors: ErrorPolytope, dt: float) -> float:
+    """Return what the exponential misses of the mean of those at the vertices, at most."""
+    diameter = dt * max(float(np.linalg.norm(one - other)) for one in errors.A for other in errors.A)
+    share = (1.0 - 1.0 / errors.count) / 4.0
+    return diameter * diameter * share * _growth(errors, dt) * _ROOM if diameter else 0.0
 
 
 @arguments_checked
@@ -97,7 +109,7 @@ def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float
     Raises
     ------
     SpecError
-        ``dt`` or ``rate`` is not a positive number.
+        ``dt`` or ``rate`` is not a positive number, or the bound is not finite.
 
     Examples
     --------
@@ -107,7 +119,10 @@ def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float
     """
     real_number(dt, "dt", "a positive number of seconds", above=0.0)
     real_number(rate, "rate", "a positive number", above=0.0)
-    return rate * dt**2 * _growth(errors, dt) / 2.0 * _ROOM
+    with np.errstate(over="ignore"):
+        bound = rate * dt * dt * _growth(errors, dt) / 2.0 * _ROOM
+    _require_finite_square(bound, dt)
+    return bound
 
 
 def _times(dt: float, matrix: FloatArray) -> AffineMatrix:
@@ -124,4 +139,15 @@ def _growth(errors: ErrorPolytope, dt: float) -> float:
         largest = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[-1])
         return largest + (_ROOM - 1.0) * float(np.linalg.norm(matrix))
 
-    return math.exp(max(0.0, *map(logarithmic_norm, errors.A)) * dt)
+    exponent = max(0.0, *map(logarithmic_norm, errors.A)) * dt
+    return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
+
+
+def _require_finite_square(bound: float, dt: float) -> None:
+    """Refuse a bound that no inequality can hold: its square is in each."""
+    if not math.isfinite(bound * bound):
+        raise SpecError(
+            f"Nothing finite bounds what samples of {dt:.6g} s miss, so much can errors grow or parameters move within "
+            "one: take a smaller dt, or states in units of like size.",
+            path="dt",
+        )
