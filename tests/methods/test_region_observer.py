@@ -416,6 +416,17 @@ def test_rates_alone_do_not_run_away_where_noise_is_stated() -> None:
         assert np.abs(made.gains["L"]).max() < 1e4
 
 
+def test_the_fastest_decay_says_what_noise_does_to_it() -> None:
+    """A step of implicit Euler, by hand: the slope of x^3 over [-1, 1] is between 0 and 3."""
+    model = DAEModel({"a": "der(x) = -x - x ** 3"}, {"y": "x"}, states={"x": 0.0}, inputs={}, parameters={})
+    made = obsynth.region_observer(model, region={"x": [-1, 1]}, sample_time=0.5, goal="decay")
+    gain = float(made.gains["L"].item())
+    moved = 0.5 * gain / (1.0 + 0.5 * (1.0 + 1.5 + gain))
+    assert f"a deviation of 1 in y moves the estimate of x by {moved:.3g} within a sample" in made.notes[-1]
+    given = obsynth.region_observer(model, region={"x": [-1, 1]}, sample_time=0.5, goal="decay", gains=[[3.0]])
+    assert not any("within a sample" in note for note in given.notes)
+
+
 def test_what_depends_on_known_inputs_alone_needs_no_range() -> None:
     model = DAEModel(
         {"a": "der(x) = -x + 0.2 * x ** 3 + sign(u) * sqrt(abs(u))"}, {"y": "x"}, states={"x": 0.0}, inputs={"u": 0.0},

@@ -53,6 +53,11 @@ def test_functions_of_parameters_are_enclosed_and_shared() -> None:
         (["p * (1 + q)", "p * q", "p"], ("p", "p * q")),
         (["(1 + 0.2 * p) * sin(q)"], ("(1 + 0.2 * p) * sin(q)",)),
         (["p * (1 + q) - p * q"], ("(1 + q) * p", "p * q")),
+        (["-76 / q", "36 / (2 * q)", "3 * (1 / q) + p", "q ** (-1)"], ("p", "1 / q")),
+        (["2 / q ** 2 - p", "1 / q / q", "(1 / q) * (3 / q)", "(2 * q) ** (-2)"], ("p", "1 / (q ** 2)")),
+        (["2 * p * (1 / q)", "p / (3 * q)", "(1 / q) * p"], ("p / q",)),
+        (["2 / (1 + p) + q", "-1 / (1 + p) / 3"], ("q", "1 / (1 + p)")),
+        (["0 / (1 + q) + p", "q"], ("p", "q")),
     ],
 )
 def test_multiples_of_one_function_are_one(texts: list[str], functions: tuple[str, ...]) -> None:

@@ -433,9 +433,11 @@ def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Calla
             factor, text_of_base = monomials[0]
             times = int(forms[1].constant)
             return LinearForm(Fraction(0), {_text_of_factors(_factors(text_of_base) * times): factor**times})
-        if operation is np.divide and any(monomials):
-            (above, x), (below, y) = (form.monomial or (Fraction(1), form.text) for form in forms)
-            return LinearForm(Fraction(0), {TEXTS_OF_OPERATIONS[operation](x, y): above / below})
+        if operation is np.power and not forms[1].parts and -forms[1].constant in (1, *SMALL_POWERS):
+            below = done(forms[0], LinearForm(-forms[1].constant)) if forms[1].constant != -1 else forms[0]
+            return _quotient(LinearForm(Fraction(1)), below)
+        if operation is np.divide and (any(monomials) or not forms[0].parts) and forms[1].parts:
+            return _quotient(*forms)
         text = (
             TEXTS_OF_OPERATIONS[operation](*(form.text for form in forms)) if operation in TEXTS_OF_OPERATIONS else None
         )
@@ -450,6 +452,26 @@ def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Calla
     return done
 
 
+def _quotient(above: LinearForm, below: LinearForm) -> LinearForm:
+    """Return a quotient whose divisor moves: numbers are taken out of both, and a quotient of one is its inverse's."""
+    number, x = above.monomial or (Fraction(1), above.text)
+    if not above.parts:
+        number, x = above.constant, "1"
+    divisor, y = below.monomial or (Fraction(1), below.text)
+    if (inverse := _inverse_of(x)) is not None:
+        x, y = "1", _text_of_factors([*_factors(inverse), *_factors(y)])
+    return LinearForm(Fraction(0), {TEXTS_OF_OPERATIONS[np.divide](x, y): number / divisor} if number else {})
+
+
+def _inverse_of(text: str) -> str | None:
+    """Return what one is divided by; `None` of anything else."""
+    below = text.removeprefix("1 / ")
+    if below == text or _FACTOR.fullmatch(below):
+        return None if below == text else below
+    depths = list(itertools.accumulate((letter == "(") - (letter == ")") for letter in below))
+    return below[1:-1] if below.startswith("(") and depths.index(0) == len(below) - 1 else None
+
+
 def _product(one: LinearForm, other: LinearForm, *, expanded: bool) -> LinearForm:
     """Return the product of two forms that both move."""
     if expanded and len(one.parts) * len(other.parts) <= MOST_EXPANDED:
@@ -458,12 +480,18 @@ def _product(one: LinearForm, other: LinearForm, *, expanded: bool) -> LinearFor
         for (x, a), (y, b) in itertools.product(one.parts.items(), other.parts.items()):
             total = total.plus(LinearForm(Fraction(0), {_text_of_factors([*_factors(x), *_factors(y)]): a * b}), 1)
         return total
-    factor, factors = Fraction(1), list[str]()
+    factor, factors, divisors = Fraction(1), list[str](), list[str]()
     for form in (one, other):
         own, text = form.monomial or (Fraction(1), "")
         factor *= own
-        factors += _factors(text) if text else [form.text]
-    return LinearForm(Fraction(0), {_text_of_factors(factors): factor})
+        if (inverse := _inverse_of(text)) is not None:
+            divisors += _factors(inverse)
+        else:
+            factors += _factors(text) if text else [form.text]
+    product = _text_of_factors(factors) or "1"
+    if divisors:
+        product = TEXTS_OF_OPERATIONS[np.divide](product, _text_of_factors(divisors))
+    return LinearForm(Fraction(0), {product: factor})
 
 
 def _factors(text: str) -> list[str]:

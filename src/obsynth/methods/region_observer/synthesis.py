@@ -39,6 +39,7 @@ from obsynth.verification.nonlinear_region import (
     directions,
     fastest_decay,
     middle_and_half,
+    whole_gain,
 )
 from obsynth.verification.over_region import GAIN_WITNESSES, rows_of_euler, stored_witness
 
@@ -94,7 +95,7 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
         observer,
         Certificate(matrices, claims),
         {"engine": "lmi", "runs": solution.runs},
-        tuple(_notes(region, observer, asked)),
+        (*_notes(region, observer, asked), *_noise_notes(terms, slopes, bounds, gain, asked)),
     )
 
 
@@ -371,3 +372,29 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
         "keep it small."
     )
     return notes
+
+
+def _noise_notes(
+    terms: NonlinearTerms, slopes: tuple[Slope, ...], bounds: FloatArray, gain: FloatArray, asked: RegionObserverMethod
+) -> list[str]:
+    """Return what noise does to a design for the fastest decay, which weighs none: a step of it from rest, where the
+    slopes are in the middle of their bounds."""
+    if asked.goal != "decay" or asked.gains is not None or not gain.size:
+        return []
+    W, Wy, V = directions(terms, slopes)
+    middle, _ = middle_and_half(bounds)
+    nd, step = terms.differential, asked.sample_time or 0.0
+    corrected = whole_gain(terms, gain)
+    A = terms.A + W @ np.diag(middle) @ V - corrected @ (terms.C + Wy @ np.diag(middle) @ V)
+    moved = np.diag(np.arange(len(A)) < nd) - step * A
+    try:
+        effects = np.linalg.solve(moved, step * corrected)
+    except np.linalg.LinAlgError:
+        return []
+    place, output = np.unravel_index(int(np.argmax(np.abs(effects))), effects.shape)
+    return [
+        f"The fastest decay weighs no noise, and its gains are large where a plant allows it: a deviation of 1 in "
+        f"{terms.output_names[output]} moves the estimate of {terms.names[place]} by "
+        f"{abs(effects[place, output]):.3g} within a sample. For gains that weigh noise state it, with goal: power and "
+        "the least decay that you need."
+    ]

@@ -31,6 +31,8 @@ from obsynth.plants.signal_names import index_of
 ARGUMENT = "s"
 #: What stands before the name of a state for its derivative; no name of a model has a space.
 _RATE = "rate of "
+#: Exponents of powers that numbers are taken out of.
+TAKEN_OUT_OF_POWERS = (*range(-8, 0), *range(2, 9))
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,8 @@ class _Registry:
                     "slope. Give a smooth formula; abs, min and max are allowed.",
                     condition="jump",
                 )
-            return _Form(terms={TEXTS_OF_OPERATIONS[operation](*map(self._text, forms)): Fraction(1)})
+            factor, plain = _without_numbers(operation, forms)
+            return _Form(terms={TEXTS_OF_OPERATIONS[operation](*map(self._text, plain)): factor})
 
         return done
 
@@ -276,6 +279,29 @@ class _Registry:
         if form.constant or not parts:
             parts.append(exact_number(form.constant))
         return parts[0] if len(parts) == 1 and _is_factor(parts[0]) else f"({' + '.join(parts)})"
+
+
+def _without_numbers(operation: Callable[..., Any], forms: list[_Form]) -> tuple[Fraction, list[_Form]]:
+    """Return the number that can be taken out of a product, a quotient or a power, and what is left: multiples of one
+    nonlinearity are one, with one slope."""
+    if operation in (np.multiply, np.divide):
+        (one, x), (other, y) = map(_split, forms)
+        return (one * other if operation is np.multiply else one / other), [x, y]
+    if operation is np.power and forms[1].is_constant and forms[1].constant in TAKEN_OUT_OF_POWERS:
+        factor, base = _split(forms[0])
+        return factor ** int(forms[1].constant), [base, forms[1]]
+    return Fraction(1), forms
+
+
+def _split(form: _Form) -> tuple[Fraction, _Form]:
+    """Return a form as a number, and what it is a multiple of: a signal, a combination in units of its first
+    coefficient, or one nonlinearity."""
+    if form.is_constant:
+        return (form.constant, _Form(Fraction(1))) if form.constant else (Fraction(1), form)
+    if form.constant or (form.linear and form.terms) or len(form.terms) > 1:
+        return Fraction(1), form
+    unit = _normalised(form.linear)[1] if form.linear else next(iter(form.terms.values()))
+    return unit, form.times(1 / unit)
 
 
 def _is_factor(text: str) -> bool:
