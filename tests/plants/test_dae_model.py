@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
 
-from obsynth import DAEModel, SpecError, dae_adaptive_observer, identifiability
+from obsynth import (
+    DAEModel,
+    SpecError,
+    dae_adaptive_observer,
+    eliminate_algebraic_states,
+    identifiability,
+    linearise,
+    simulate_dae,
+)
 from obsynth.analysis.dae_structure import index_report
 from obsynth.methods.designing import check
 from obsynth.plants.dae_functions import DAEFunctions
@@ -41,7 +50,6 @@ def small(**changes) -> DAEModel:
         ({"equations": {"moves": "der(a) = a ^ 2", "holds": "b = c"}}, ["'a^2' is not allowed", "written **"]),
         ({"states": {"a": 1.0, "b": float("nan")}}, ["states.b", "finite"]),
         ({"inputs": {"go": 1.0, "a": 2.0}}, ["'a'", "more than one"]),
-        ({"outputs": {"seen": "b + go"}}, ["output depends on an input"]),
         ({"parameters": {"sin": 1.0}}, ["'sin'"]),
         ({"outputs": {}}, ["outputs is empty"]),
         ({"equations": {"moves": "der(a) = -c * a if a > 0 else b", "holds": "b = go"}},
@@ -293,3 +301,47 @@ def test_the_check_before_any_design_says_what_the_outputs_do_not_tell(model, wo
     detail = report["exists: parameters"].detail
     assert [word for word in words if word not in detail] == []
     assert ("phi (" in detail) == ("phi (" in words)
+
+
+def test_an_output_may_read_an_input_directly_or_through_definitions() -> None:
+    """A terminal voltage is lower by what the current drops at a resistor; it was refused."""
+    written = DAEModel(
+        {"charge": "capacity * der(s) = -current", "branch": "der(v) = current - v"},
+        {"voltage": "3 + s - drop", "twice": "2 * current + current_now_"},
+        states={"s": 0.5, "v": 0.0}, inputs={"current": 2.0, "other": 1.0}, parameters={"r": 0.1},
+        constants={"capacity": 10.0, "current_now_": 1.0},
+        definitions={"lost": "r * current + other", "drop": "v + lost"},
+    )  # fmt: skip
+    assert list(written.states.items()) == [("s", 0.5), ("v", 0.0), ("current_now", 2.0), ("other_now", 1.0)]
+    assert written.equations["current_now"] == "current_now = current"
+    assert DAEModel(**written.as_dict()).as_dict() == written.as_dict()
+    linear = eliminate_algebraic_states(linearise(written, at="point", drift=True)).plant
+    inputs = list(linear.input_names)
+    direct = linear.D[:, [inputs.index("current"), inputs.index("other")]]
+    np.testing.assert_allclose(direct, [[-0.1, -1.0], [2.0, 0.0]], atol=1e-12)
+
+
+def test_a_state_that_equals_an_input_has_a_name_of_its_own() -> None:
+    model = DAEModel(
+        {"moves": "der(go_now) = go - go_now"}, {"seen": "go_now + go"}, states={"go_now": 0.0}, inputs={"go": 1.0}
+    )
+    assert list(model.states) == ["go_now", "go_now_"]
+    assert model.outputs["seen"] == "go_now + go_now_"
+
+
+def test_an_output_that_reads_an_input_is_observed() -> None:
+    """The same as with the state and its equation written by hand."""
+    fields: dict[str, Any] = {
+        "states": {"x": 1.0}, "inputs": {"u": 1.0}, "parameters": {"r": 0.5},
+    }  # fmt: skip
+    equations = {"moves": "der(x) = -x + u"}
+    short = DAEModel(equations, {"y": "x + r * u"}, **fields)
+    long = DAEModel(
+        {**equations, "u_now": "u_now = u"}, {"y": "x + r * u_now"}, **{**fields, "states": {"x": 1.0, "u_now": 1.0}}
+    )
+    assert short.as_dict() == long.as_dict()
+    design = dae_adaptive_observer(short, dt=0.1, Q={"moves": 1e-4}, R=1e-4)
+    u = 1.0 + np.sin(0.3 * np.arange(200))[:, None]
+    record = simulate_dae(short, u, dt=0.1, parameters=[0.7], seed=1, R=[[1e-4]])
+    estimates = design.observer.run(record.outputs, u)
+    assert abs(float(estimates.parameters[-1, 0]) - 0.7) < 0.05

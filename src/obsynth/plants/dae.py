@@ -20,6 +20,7 @@ from obsynth.numerics.libraries import imported
 from obsynth.plants.checking import Problems, checked_units
 from obsynth.plants.dae_checks import check_distinct, check_structure
 from obsynth.plants.dae_equations import EQUALS
+from obsynth.plants.dae_feedthrough import with_inputs_as_states
 from obsynth.plants.dae_fields import DAEFields, Equations
 from obsynth.plants.other_names import plant_keywords_suggested
 from obsynth.plants.signal_names import checked_names
@@ -49,7 +50,8 @@ class DAEModel(DAEFields):
         states; or a function ``F(rates, x, u, theta)`` of lists that returns a list, written with numpy's functions
         (``where`` instead of ``if``).
     outputs : mapping of str to str, or callable
-        Name -> expression of states and parameters; or a function ``h(x, theta)`` that returns a list.
+        Name -> expression of states and parameters; or a function ``h(x, theta)`` that returns a list.  Each input that
+        texts read becomes a state ``NAME_now`` that equals it (its equation has no noise, unless Q names it).
     states : mapping of str to float
         Name -> nominal value, which also scales it (one where the value is zero).
     inputs : mapping of str to float, optional
@@ -118,6 +120,8 @@ class DAEModel(DAEFields):
         expressions = {} if definitions is None else definitions
         fields["definitions"] = problems.collect(partial(_checked_texts, expressions, "definitions"))
         problems.raise_if_any()
+        if not callable(equations) and not callable(outputs):
+            fields = with_inputs_as_states(fields)
         for field, names, what in (
             ("equation_names", equation_names, "equations"),
             ("output_names", output_names, "outputs"),
