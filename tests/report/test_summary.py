@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.monitoring.verbs.data_arguments import own_tolerances
 from obsynth.report.designs import design_warnings, followed_steps
 from obsynth.report.plots.frequency import _state_response, fault_gains
 from obsynth.report.summary import summary
@@ -246,3 +247,15 @@ def test_a_summary_says_where_nothing_is_proved_of_constant_faults() -> None:
     )
     assert told in summary(obsynth.ui_pi_observer(region)).facts
     assert told not in summary(obsynth.descriptor_kalman(plant)).facts
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_what_accounts_for_tolerances_is_what_run_does(sampled: bool) -> None:
+    """Of a continuous design with known inputs ``run --monitor pointwise`` takes the exact model."""
+    matrices = {"A": [["-R", 0.1], [0.0, -1.0]], "B": [[1.0], [0.0]], "C": np.eye(2), "Bf": [[1.0], [0.0]], "dt": 0}
+    plant = obsynth.uncertain_system(matrices, {"R": {"nominal": 2.0, "tolerance": "3 %"}})
+    design = obsynth.ui_pi_observer(obsynth.discretise(plant, 0.1) if sampled else plant)
+    words = " ".join(str(design).split())
+    assert ("only --monitor pointwise accounts for tolerances" in words) == sampled
+    assert ("only --monitor pointwise of a sampled plant (transform: sample_time) accounts" in words) != sampled
+    assert (own_tolerances(design, "pointwise") is not None) == sampled

@@ -102,6 +102,13 @@ MISTAKES = {
         "name: first\nscenario: {horizon: 9, faults: {f1: {kind: step, size: 1}}}",
         3,
     ),
+    "slope of a ramp": Mistake(
+        "name: first",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {kind: ramp, slope: 1}}}",
+        "slope: unknown key. The keys here are kind, start, end, rate.",
+        "name: first\nscenario: {horizon: 9, faults: {f1: {kind: ramp, rate: 1}}}",
+        3,
+    ),
     "profile by another word": Mistake(
         "name: first",
         "name: first\nscenario: {horizon: 9, faults: {f1: {type: step, size: 1, begin: 2}}}",

@@ -50,8 +50,11 @@ def test_refused_studies(drive, options: dict, words: str) -> None:
     with pytest.raises(SpecError, match=words):
         obsynth.tolerance_study(*drive, **options)
     bare = drive[0].replace(plant=drive[0].plant.replace(uncertainty=None))
-    with pytest.raises(SpecError, match="no tolerances"):
+    with pytest.raises(SpecError, match="No constant of the plant has a tolerance: state some in the plant, such"):
         obsynth.tolerance_study(bare, drive[1])
+    varying = obsynth.design(drive[0].plant, "descriptor-kalman")
+    with pytest.raises(SpecError, match="is by descriptor-kalman: leave tolerances out, or take a linear method"):
+        obsynth.tolerance_study(varying, drive[1])
 
 
 @pytest.mark.long

@@ -298,7 +298,13 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
         held = ", disturbances held over each sample" if is_of_held_disturbances(design) else ""
-        yield f"the model is exact{held}" + ("; only --monitor pointwise accounts for tolerances" if some else "")
+        # Of a continuous design with known inputs a threshold over tolerances takes inputs as held between rows, which
+        # must be asked for.
+        is_asked = design.plant.nu and not design.plant.is_discrete
+        sampled = " of a sampled plant (transform: sample_time)" if is_asked else ""
+        yield f"the model is exact{held}" + (
+            f"; only --monitor pointwise{sampled} accounts for tolerances" if some else ""
+        )
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
     elif isinstance(design.observer, RegionObserver):

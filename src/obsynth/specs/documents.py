@@ -368,6 +368,7 @@ def _explained(
     elif kind == "extra_forbidden":
         known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
         beside = _value_at(document, location[:-1])
+        known = _keys_of_profile(beside, known)
         beside = list(beside) if isinstance(beside, dict) else []
         meant = name_meant(key, known, beside) or _option_hint(key, prefix, names, known)
         text = f"unknown key.{meant or _plant_hint(key, prefix, names) or instead_of_section(value, known)}"
@@ -482,6 +483,17 @@ def _wanted_in_words(kind: str, context: Mapping[str, Any]) -> str:
         "list_of_no_rows": "a list of rows",
     }
     return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
+
+
+def _keys_of_profile(section: Any, known: list[str]) -> list[str]:
+    """Return of the keys of any profile of a scenario those that its kind has; other keys as they are."""
+    from obsynth.simulation.scenario import PROFILE_KINDS
+    from obsynth.specs import schema
+
+    kind = section.get("kind") if isinstance(section, dict) else None
+    if known != list(schema.ProfileSection.model_fields) or not isinstance(kind, str) or kind not in PROFILE_KINDS:
+        return known
+    return ["kind", *field_types(PROFILE_KINDS[kind])]
 
 
 def _known_keys(location: Sequence[str | int]) -> list[str]:

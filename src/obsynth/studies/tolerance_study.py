@@ -18,7 +18,9 @@ from obsynth.monitoring.thresholds.residual_monitor import monitor
 from obsynth.numerics.arguments import arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.numerics.outward import upper_text
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import RESULT_FILE, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import design_as_dict
@@ -258,10 +260,21 @@ def tolerance_study(
     [0.0, 0.05]
     """
     whole_number(runs, "runs")
+    if not (isinstance(design.observer, LinearObserver) and isinstance(design.plant, DescriptorSystem)):
+        raise SpecError(
+            f"Thresholds that adapt to tolerances are those of linear designs of plants with constant matrices, and "
+            f"{design.name!r} is by {design.method}: leave tolerances out, or take a linear method (for equations with "
+            "transform: {linearise: ...}).",
+            path="design",
+        )
     plant, observer = design.linear
     box = None if plant.uncertainty is None else plant.uncertainty.box
     if box is None or not box.names:
-        raise SpecError("The plant's constants have no tolerances: state constants.", path="design")
+        raise SpecError(
+            "No constant of the plant has a tolerance: state some in the plant, such as constants: {R: {nominal: 2, "
+            "tolerance: 5 %}}, and name them in its matrices (in Python obsynth.uncertain_system).",
+            path="design",
+        )
     zero = [item.name for item in box.uncertain if item.nominal == 0.0]
     if zero:
         raise SpecError(f"The nominal value of {zero[0]!r} is zero, which has no per cent.", path="tolerances")
