@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -493,7 +493,7 @@ def _keys_of_profile(section: Any, known: list[str]) -> list[str]:
     kind = section.get("kind") if isinstance(section, dict) else None
     if known != list(schema.ProfileSection.model_fields) or not isinstance(kind, str) or kind not in PROFILE_KINDS:
         return known
-    return ["kind", *field_types(PROFILE_KINDS[kind])]
+    return ["kind", *(part.name for part in fields(PROFILE_KINDS[kind]))]
 
 
 def _known_keys(location: Sequence[str | int]) -> list[str]:

@@ -205,7 +205,7 @@ def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check
     fitting = base is not None and tracking is not None and len(tracking) == observer.order
     row = upper_bound_check(
         "mean",
-        f"each fault estimate is exactly the mean of the last {mean} of the filter that is checked below",
+        f"each fault estimate is exactly the mean of the last {mean} estimates of the filter that is checked below",
         float(not fitting),
         0.0,
         source="shipped realisation",

@@ -213,7 +213,8 @@ def _mean_rows(design: ObserverDesign) -> Iterator[Check]:
         missed = max(missed, float(np.max(np.abs(observer.Cz[rows] @ states + direct), initial=0.0)))
     yield upper_bound_check(
         "mean",
-        f"each fault estimate is a mean of the last {mean}: at the roots of unity it shows nothing",
+        f"each fault estimate is a mean over {mean} samples: what repeats every {mean} samples with mean zero leaves "
+        "nothing",
         missed,
         DECOUPLING_LEVEL * size,
         source="computed from the transfer function of the filter",
