@@ -457,6 +457,7 @@ def test_check_takes_a_spec_whose_transformation_samples_the_delays(tmp_path, ca
     printed = " ".join(capsys.readouterr().out.split())
     assert "functional-filter: all conditions hold" in printed
     assert "as written without delays" in printed
+    assert "x1; x2; u1, 1 sample ago; u1, 2 samples ago" in printed  # commas are in the names
     assert main(["check", "--system", str(spec), "--json"]) == 0
     structure = json.loads(capsys.readouterr().out)["structure"]
     assert set(structure) == {"as_written_without_delays", "as_the_method_sees_it"}

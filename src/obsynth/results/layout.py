@@ -127,12 +127,14 @@ def complex_numbers(values: Iterable[complex]) -> str:
 
 
 def name_list(names: Sequence[str], *, limit: int = 6) -> str:
-    """Return names separated by commas; of a long list the first ones and how many more there are."""
+    """Return names separated by commas, or by semicolons where commas are in names (``valve, 1 sample ago``); of a long
+    list the first ones and how many more there are."""
     if not names:
         return "none"
+    between = "; " if any("," in name for name in names) else ", "
     if len(names) <= limit + 1:
-        return ", ".join(names)
-    return f"{', '.join(names[:limit])} and {len(names) - limit} more"
+        return between.join(names)
+    return f"{between.join(names[:limit])} and {len(names) - limit} more"
 
 
 def align_numbers(table: Table) -> Table:
