@@ -79,6 +79,16 @@ def test_states_that_a_model_of_noise_adds_need_no_row_in_the_recovery() -> None
     assert "recovery as written" in {row.name for row in design.report.checks if row.passed}
 
 
+def test_the_way_back_to_a_network_too_large_to_be_held_is_assumed() -> None:
+    """Its elimination was held against the plant that was sampled, which has fewer states: no design was verified."""
+    eliminated = obsynth.eliminate_algebraic_states(CONSTRAINED)
+    # As that of a sparse network, which leaves no note.
+    object.__delattr__(eliminated.plant, "_made_from")
+    design = obsynth.ui_pi_observer(obsynth.discretise(eliminated, 0.1))
+    assert design.recovery.names == CONSTRAINED.state_names
+    assert [row.status for row in design.report.checks if row.name == "plant as written"] == ["assumed"]
+
+
 def test_a_negative_gain_is_no_bound() -> None:
     design = DESIGNS["optimal-filter"]()
     certificate = replace(

@@ -34,7 +34,7 @@ from obsynth.plants.transformations.recovery import StateRecovery, Transformatio
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.plant_source import source_of
+from obsynth.results.plant_source import PlantSource, source_of
 from obsynth.results.verification_report import MethodReports, VerificationReport, failed_rows
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
@@ -442,8 +442,20 @@ def draft_of(
         solver=synthesis.solver,
         notes=synthesis.notes,
         recovery=recovery,
-        source=source,
+        source=_source_of_recovery(source, recovery),
     )
+
+
+def _source_of_recovery(source: PlantSource | None, recovery: StateRecovery | None) -> PlantSource | None:
+    """Return the source that a way back leads to; ``None`` where it leads further back, to a plant as written that is
+    too large to be held: then the way back cannot be done again."""
+    if source is None or recovery is None:
+        return source
+    try:
+        known = source.derived.recovery.names
+    except ObsynthError:
+        return source
+    return source if set(recovery.names) <= set(known) else None
 
 
 def verified(
