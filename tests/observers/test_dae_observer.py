@@ -462,3 +462,30 @@ def test_a_reactor_that_may_run_away_is_designed() -> None:
     made = obsynth.extended_kalman(reactor, dt=0.05, Q={"mass": 1e-6, "heat": 1.0}, R={"T": 0.01})
     (row,) = [check for check in made.report.checks if check.name == "NEES"]
     assert re.search(r"starts that have no solution over [23] steps were drawn again: \d+", row.detail)
+
+
+@pytest.mark.parametrize("form", ["random-walk", "augmented-kalman"])
+def test_errors_decay_as_where_the_parameters_are_known_whatever_the_form(form: str) -> None:
+    """A battery whose resistance may walk was refused in the form of one joint filter: the state's rows of its gain
+    also make up for what it moves the resistance by, and have no decay of their own."""
+    battery = DAEModel(
+        {"charge": "7200 * der(s) = -current", "branch": "1000 * der(v) = current - 50 * v"},
+        {"voltage": "3.2 + s - v - r * current"},
+        states={"s": 0.8, "v": 0.0}, inputs={"current": 1.0}, parameters={"r": 0.05},
+    )  # fmt: skip
+    design = dae_adaptive_observer(
+        battery, dt=1.0, Q={"charge": 1e-3, "branch": 1e-3}, R=1e-4, form=form, random_walk=1e-8,
+        initial_parameter_covariance=1e-3,
+    )  # fmt: skip
+    # The filter of the states alone, written out; the last transition has the gain of the sample before it.
+    F, H = np.diag([1.0, 1.0 / 1.05, 0.0]), np.array([[1.0, -1.0, -0.05]])
+    noise, P = np.diag([1e-3 / 7200.0**2, 1e-3 / 1050.0**2, 0.0]), np.array(design.observer.initial_covariance)
+    for _ in range(100):
+        K = P @ H.T / (H @ P @ H.T + 1e-4)
+        P = F @ (np.eye(3) - K @ H) @ P @ F.T + noise
+    before = np.max(np.abs(np.linalg.eigvals(F @ (np.eye(3) - K @ H))))
+    # In the form of two filters the walk of the resistance leaves some noise to the states.
+    assert design.certificate.claims["contraction"] == pytest.approx(
+        before, abs=3e-3 if form == "random-walk" else 1e-9
+    )
+    assert before < 0.99

@@ -190,7 +190,10 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     allowed = DERIVATIVE_TOLERANCE * sizes * (units[:, None] / units[None, :])[None]
     last = Ball(facts.transitions[-1], allowed[-1])
     rate = proved_rate(last)
-    claim = "F (I - K H) at the end of the nominal run makes errors smaller: its spectral radius"
+    claim = (
+        "where the parameters are known, F (I - K H) at the end of the nominal run makes errors smaller: its spectral "
+        "radius"
+    )
     source, decay = f"{SOURCE}, convergence", f"decay in {facts.decay_time:.3g} steps"
     scope = f"for all derivatives within {DERIVATIVE_TOLERANCE:g} of the computed ones, in sizes of the signals"
     if rate is None:

@@ -131,7 +131,9 @@ class DaeAdaptiveObserver(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "index": ClaimMeaning("", "index of the plant", "claims"),
         "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run", "claims"),
-        "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at the end of the nominal run", "claims"),
+        "contraction": ClaimMeaning(
+            "", "spectral radius of F (I - K H) at the end of the nominal run, where the parameters are known", "claims"
+        ),
         "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
     }
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})

@@ -158,7 +158,7 @@ class DAEFacts:
     condition: float  # largest condition number of (7) along the run
     condition_k: int  # the sample at which it is largest
     residual: float  # largest scaled Newton residual
-    contraction: float  # spectral radius of F (I - K H) at the end
+    contraction: float  # spectral radius of the last of the transitions
     deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters at the end
     # ``(nq, nq)``: of the parameters' errors at the end: how much a change of one is taken for another
     correlations: FloatArray
@@ -166,7 +166,7 @@ class DAEFacts:
     identifiable: Identifiability  # of states and parameters along the nominal trajectory
     K: FloatArray  # ``(nx, ny)`` at the end
     Upsilon: FloatArray  # ``(nx, nq)`` at the end
-    transitions: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
+    transitions: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step, K the gain where parameters are known
     parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
 
     @property
@@ -187,14 +187,15 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model = observer.model
     u = np.array(model.nominal_input)
     outputs = _nominal_outputs(observer, u)
-    gathered, transitions = GatheredRows(observer), []
+    gathered, parts = GatheredRows(observer), []
 
     def add(rows: DAERow) -> None:
         gathered.add(rows)
-        transitions.append(np.array(rows.several.part("kept")))
+        parts.append({name: np.array(rows.several.part(name)) for name in ("kept", "F", "H", "noise")})
 
     end = advanced(observer.steps, outputs, np.tile(u, (len(outputs), 1)), add)
     estimates = gathered.estimates()
+    transitions = _transitions(observer, {name: np.concatenate([each[name] for each in parts]) for name in parts[0]})
     covariance = estimates.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
@@ -213,16 +214,37 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         condition=float(estimates.conditions.max()),
         condition_k=int(np.argmax(estimates.conditions)),
         residual=float(estimates.residuals.max()),
-        contraction=float(estimates.contraction[-1]),
+        contraction=float(np.abs(np.linalg.eigvals(transitions[-1])).max()),
         deviations=read_only(deviations),
         correlations=read_only(covariance / np.outer(safe, safe)),
         projection=estimates.projection,
         identifiable=identifiable,
         K=read_only(observer.steps.part(end, "K")),
         Upsilon=read_only(observer.steps.part(end, "Upsilon")),
-        transitions=read_only(np.concatenate(transitions)[1:]),
+        transitions=read_only(transitions),
         parameter_covariance=read_only(covariance),
     )
+
+
+def _transitions(observer: DAEObserver, rows: dict[str, FloatArray]) -> FloatArray:
+    """Return F (I - K H) ``(steps, nx, nx)`` of every step of a run, K the gain of the state where the parameters are
+    known; ``rows``: arrays by name, a row for each sample.
+
+    In the form ``augmented-kalman`` the state's rows of the joint gain also make up for what it moves the parameters
+    by, and I - K H of these alone is the map of no error.
+    """
+    if observer.form != "augmented-kalman":
+        return rows["kept"][1:]
+    P, identity = np.array(observer.initial_covariance), np.eye(observer.model.nx)
+    transitions, error_map = [], identity
+    for k, (F, H, noise) in enumerate(zip(rows["F"], rows["H"], rows["noise"], strict=True)):
+        if k > 0:
+            P = F @ P @ F.T + noise @ observer.Q @ noise.T
+            transitions.append(F @ error_map)
+        K = np.linalg.solve(H @ P @ H.T + observer.R, H @ P).T
+        error_map = identity - K @ H
+        P = error_map @ P @ error_map.T + K @ observer.R @ K.T
+    return np.array(transitions)
 
 
 def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
