@@ -112,3 +112,11 @@ def test_its_checks_can_fail():
         inputs={"inflow": 0.5}, parameters={"drain": 0.3},
     )  # fmt: skip
     assert "exists: known parameters" in failing(design.replace(plant=other))
+
+
+def test_nothing_is_said_of_parameters_that_a_plant_lacks():
+    """An integrator that is followed slowly: its note was of errors of the parameters, and of a factor that forgets."""
+    tank = obsynth.DAEModel({"level": "der(h) = inflow"}, {"gauge": "h"}, states={"h": 1.0}, inputs={"inflow": 0.0})
+    slow = obsynth.extended_kalman(tank, dt=1.0, Q=1e-8, R=1e-2, initial_covariance=1e-4)
+    assert slow.certificate.claims["contraction"] > 0.99
+    assert not any("parameter" in note for note in slow.notes), slow.notes

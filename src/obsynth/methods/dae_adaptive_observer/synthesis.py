@@ -83,7 +83,7 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
             f"and nominal sizes: {shares}. Excite the plant, {remedy}."
         )
     window = 1.0 / (1.0 - observer.forgetting) if observer.forgetting < 1.0 else np.inf
-    if observer.form == "forgetting" and facts.decay_time > window:
+    if observer.model.nq and observer.form == "forgetting" and facts.decay_time > window:
         yield (
             f"Errors of the state decay in {facts.decay_time:.0f} steps, those of the parameters in {window:.0f}: "
             "after a jump of a parameter the estimates will be biased for the longer of the two. Raise Q, or lambda."
