@@ -273,7 +273,7 @@ class LearnedThresholds:
         if self.drift_limits:
             limits = " or of ".join(f"{name} by {limit:.2g}" for name, limit in self.drift_limits.items())
             wrong = (
-                f"an offset from the first row on of {limits} deviations of its noise alarms until it is followed"
+                f"an offset from the first row on of {limits} deviations of its noise may alarm until it is followed"
                 if self.memory
                 else f"a slow drift of {limits} deviations of its noise alarms as long as it lasts"
             )
