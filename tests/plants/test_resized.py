@@ -33,6 +33,9 @@ def test_what_has_no_entries_and_numbered_names_follow(name: str) -> None:
     assert (plant.nu, plant.ny, plant.nf, plant.nd, plant.nw) == sizes
     np.testing.assert_array_equal(plant.E, np.eye(plant.nx))
     assert plant.input_names == tuple(f"u{i + 1}" for i in range(plant.nu))
+    for matrix, given in changes.items():
+        if given is not None and not isinstance(given[0], str):
+            np.testing.assert_array_equal(getattr(plant, matrix), given)
 
 
 def test_sparse_matrices_follow_as_dense_ones_do() -> None:
