@@ -60,7 +60,7 @@ CALLS: dict[str, tuple[Callable[[Any], object], tuple[Any, ...]]] = {
     "u": (lambda v: design().observer.run(Y, v), (None, 2.5)),
     "y of a batch": (lambda v: obsynth.run_batch(design().observer, v, U), (None, 2.5)),
     "u of a batch": (lambda v: obsynth.run_batch(design().observer, Y[None], v), (None, 2.5)),
-    "Q of the steady state": (lambda v: obsynth.steady_state_filter(still(), Q=v, R=np.eye(2)), (None, -1.0)),
+    "Q of the steady state": (lambda v: obsynth.steady_state_filter(still(), Q=v, R=np.eye(2)), (-1.0,)),
     "plant of the steady state": (lambda v: obsynth.steady_state_filter(v, Q=np.eye(2), R=np.eye(2)), (None, 2.5)),
     "constants": (lambda v: varying(constants=v), (2.5,)),
     "units": (lambda v: varying(units=v), (2.5,)),
