@@ -23,7 +23,7 @@ from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
 from obsynth.monitoring.logs.unit_check import UnitCheck
-from obsynth.monitoring.thresholds.learned import LOGS_FOR_OFFSETS
+from obsynth.monitoring.thresholds.learned import logs_that_do
 from obsynth.monitoring.thresholds.learned_ranges import RowsBeyond
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
@@ -348,12 +348,10 @@ class LogRun:
         """Return a text where an alarm of learned thresholds ended as it had stood since the start."""
         if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule) or not self._watching.rule.ended:
             return ()
-        logs = self.monitor.rule.learned.logs
-        few = "one log, which does" if logs == 1 else f"{logs} logs, which do"
-        few = few if logs < LOGS_FOR_OFFSETS else f"{logs} logs without offsets of sensors, which do"
+        logs = logs_that_do(self.monitor.rule.learned.logs, joined=", which")
         return (
             f"An alarm stood when {self._watching.rule.ended} rows had been decided, and was ended there: the "
-            f"thresholds are of {few} not distinguish an offset of this log from a fault that was there "
+            f"thresholds are of {logs} not distinguish an offset of this log from a fault that was there "
             "from its first row on, so that these rows are taken for what is usual in this log"
             f"{self._raised_by_start()}. If the alarm was a fault, it may still be there. Three normal logs "
             "that hold such offsets tell (learn the thresholds from them).",

@@ -25,8 +25,8 @@ class SteppingLogObserver(LogObserver):
     where the observer says nothing of them."""
 
     saved: ClassVar = {
-        **{"observer": "state", "u": "u", "spread": "spread", "usual": "usual"},
-        **{"left_out": "left_out", "restarts": "restarts", "first_restart": "first_restart"},
+        "observer": "state",
+        **{name: name for name in ("u", "spread", "usual", "left_out", "restarts", "first_restart")},
     }
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:

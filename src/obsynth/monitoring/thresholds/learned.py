@@ -254,14 +254,12 @@ class LearnedThresholds:
                 "alarm nothing"
             )
         if self.takes_first_rows:
-            few = "one log does" if self.logs == 1 else f"{self.logs} logs do"
-            few = few if self.logs < LOGS_FOR_OFFSETS else f"{self.logs} logs without offsets of sensors do"
             later = "" if self.memory else f", and followed over {FOLLOWED_ROWS:.6g} rows from then on"
             yield (
-                f"{few} not distinguish a fault that is there from the first row of a run on from an offset of that "
-                f"log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends there, as the "
-                f"means of these rows are taken for what is usual in this log{later}, and levels rise by what the "
-                "alarm reached"
+                f"{logs_that_do(self.logs)} not distinguish a fault that is there from the first row of a run on from "
+                f"an offset of that log: an alarm that stands after {OWN_ROWS[0]} decided rows (or {OWN_ROWS[1]}) ends "
+                f"there, as the means of these rows are taken for what is usual in this log{later}, and levels rise by "
+                "what the alarm reached"
             )
         if self.sensor_drift:
             unknown = ", ".join(self.without_drift)
@@ -373,6 +371,12 @@ class LearnedThresholds:
         """
         text = sealed(LEARNED_KIND, LEARNED_VERSION, plain(self.as_dict()), under="thresholds")
         return write_atomically(path, text, kind=LEARNED)
+
+
+def logs_that_do(logs: int, *, joined: str = "") -> str:
+    """Return which normal logs do something, as subject and verb, with what is ``joined`` to the subject between."""
+    without = " without offsets of sensors" if logs >= LOGS_FOR_OFFSETS else ""
+    return f"one log{joined} does" if logs == 1 else f"{logs} logs{without}{joined} do"
 
 
 def duration(seconds: float) -> str:
