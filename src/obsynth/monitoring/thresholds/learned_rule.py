@@ -78,6 +78,17 @@ class LearnedState(NamedTuple):
     swings: Swings = Swings()  # of means of whitened rows, and of likelihood ratios, to both sides
 
 
+class _Row(NamedTuple):
+    """What a sample says to the rule, and how far it counts."""
+
+    values: FloatArray | None  # residuals and estimates, NaN where there is none
+    complete: bool  # whether all columns are there that are there usually
+    evidence: FloatArray | None  # ``(m,)``: watched columns, filled where one may decide by the others
+    counts: bool  # whether it adds evidence
+    most: float  # how far its whitened values may be from zero
+    varying: bool  # whether the gain follows what is measured
+
+
 def follow_shares(memory: float) -> tuple[float, float]:
     """Return by which share of a row the offset of residuals follows it, and by which while there is an alarm."""
     return (1.0 / memory, 1.0 / (SLOWER_IN_ALARM * memory)) if memory else (0.0, 0.0)
@@ -159,53 +170,72 @@ class LearnedRule(Rule):
 
     def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
-        missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
-        for _ in range(min(max(missing, 0), max(AGES))):
+        missing = 0 if state.last is None else max(round((sample.time - state.last) / self.learned.dt) - 1, 0)
+        state = self._begun(state, sample, missing)
+        row = self._row(state, sample)
+        if not row.complete and row.varying:
+            state = state._replace(waiting=self._model.order + 1)
+        state = self._with_row(state._replace(waiting=max(state.waiting - 1, 0)), row, sample)
+        # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
+        # stands is not ended by outputs that are left out.
+        by_rows_before = row.varying and sample.deciding and state.taken > self.learned.settling
+        if row.values is None or not (row.counts or by_rows_before):
+            return state, RuleOutput(math.nan, math.nan)
+        return self._decision(state, row, row.values, sample)
+
+    def _begun(self, state: LearnedState, sample: Sample, missing: int) -> LearnedState:
+        """Return the state with the rows that are ``missing`` before a sample, and what is counted of it."""
+        for _ in range(min(missing, max(AGES))):
             state = self._added(state, None)
         follows_nothing = missing > 0 or state.last is None
         if follows_nothing and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
             state = state._replace(waiting=self._model.order)
         state = state._replace(last=sample.time, taken=state.taken + 1, decided=int(state.decided or sample.deciding))
-        state = self._scored(state, sample.observation, max(missing, 0))
+        state = self._scored(state, sample.observation, missing)
         if sample.deciding and state.taken > self.learned.settling:
             state = self._centred(state, sample.observation)
-        state = state._replace(raised=self._raised(state.raised, sample, max(missing, 0)))
-        values_of_row = watched_values(sample.residuals, sample.observation)
-        complete = values_of_row is not None and sample.deciding and bool(np.isfinite(values_of_row[self._usual]).all())
-        evidence = (
-            None
-            if values_of_row is None or not sample.deciding
-            else self._completed(state, values_of_row, complete=complete)
-        )
+        return state._replace(raised=self._raised(state.raised, sample, missing))
+
+    def _row(self, state: LearnedState, sample: Sample) -> _Row:
+        """Return what a sample says, and how far it counts."""
+        values = watched_values(sample.residuals, sample.observation)
+        complete = values is not None and sample.deciding and bool(np.isfinite(values[self._usual]).all())
+        evidence = None
+        if values is not None and sample.deciding:
+            evidence = self._completed(state, values, complete=complete)
         counts = evidence is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.observation, Evidence)
         if counts and state.waiting and isinstance(sample.observation, Evidence):
             most = float(np.linalg.norm(sample.observation.whitened)) / self.learned.innovation
         elif state.waiting and not varying:
             most = 0.0
-        if not complete and varying:
-            state = state._replace(waiting=self._model.order + 1)
-        state = state._replace(waiting=max(state.waiting - 1, 0))
+        return _Row(values, complete, evidence, counts, most, varying)
+
+    def _with_row(self, state: LearnedState, row: _Row, sample: Sample) -> LearnedState:
+        """Return the state with a row, or with what the rows before it predict where it says nothing."""
         # What follows a warm-up is predicted from its last rows: from the mean, a slow estimate would come as a jump.
-        kept = varying or not state.decided
-        if values_of_row is None or not (
-            complete or (kept and (counts or np.isfinite(values_of_row[self._places]).all()))
+        kept = row.varying or not state.decided
+        if row.values is None or not (
+            row.complete or (kept and (row.counts or np.isfinite(row.values[self._places]).all()))
         ):
             state = self._followed(self._added(state, None), sample.observation)
-            if self._rests_on_the_past and not varying:
+            if self._rests_on_the_past and not row.varying:
                 state = state._replace(waiting=self._model.order)
-        else:
-            watched = values_of_row[self._places]
-            filled = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
-            seen = np.isfinite(watched) if complete or varying else None
-            state = self._followed(
-                self._added(state, filled, most, evidence), sample.observation, seen, counts=counts and most > 0.0
-            )
-        # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
-        # stands is not ended by outputs that are left out.
-        by_rows_before = varying and sample.deciding and state.taken > self.learned.settling
-        if values_of_row is None or not (counts or by_rows_before):
-            return state, RuleOutput(math.nan, math.nan)
+            return state
+        watched = row.values[self._places]
+        filled = watched if row.evidence is None else np.where(np.isfinite(watched), watched, row.evidence)
+        seen = np.isfinite(watched) if row.complete or row.varying else None
+        return self._followed(
+            self._added(state, filled, row.most, row.evidence),
+            sample.observation,
+            seen,
+            counts=row.counts and row.most > 0.0,
+        )
+
+    def _decision(
+        self, state: LearnedState, row: _Row, values: FloatArray, sample: Sample
+    ) -> tuple[LearnedState, RuleOutput]:
+        """Return the state after a row of ``values`` that is decided, and the decision."""
         # Products of numbers that overflow have passed any level.
         with np.errstate(all="ignore"):
             ratios, sides = self._likelihood_ratios(state)
@@ -214,26 +244,24 @@ class LearnedRule(Rule):
             first = [float(np.sum(state.white[-1] ** 2))]
             changes = self._changes(state, self._bands)
             squares = self._squares(state, sample.observation)
-            values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
+            statistics = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares])
             state, levels = self._swung(state, weights, sides * ratios, first[0], sample.time)
-            values = values / levels
-        values = np.where(np.isnan(values), np.inf, values)
-        largest = float(values.max())
+            statistics = statistics / levels
+        statistics = np.where(np.isnan(statistics), np.inf, statistics)
+        largest = float(statistics.max())
         reached = largest * state.room
         state = self._roomy(state._replace(alarmed=int(largest > 1.0)), reached)
-        state = self._own_of_start(state, sample.observation, reached, counts=counts)
+        state = self._own_of_start(state, sample.observation, reached, counts=row.counts)
         # Faults are compared without what their slow offsets explain: each has its own.
-        fault = (
-            self._fault(values_of_row, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
-        )
+        fault = self._fault(values, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
         ranking = None
-        if self.effects is not None and values.max() > 1.0:
+        if self.effects is not None and largest > 1.0:
             effects, ranking = self.effects.explained(state.effects)
             state = state._replace(effects=effects)
             if ranking is None and self._walk is not None:
-                by_fault = values[-2 * len(self._faults) :].reshape(2, -1)
+                by_fault = statistics[-2 * len(self._faults) :].reshape(2, -1)
                 ranking = ranked_changes(self._names, self._changes(state, 0.0), by_fault.max(axis=0) > 1.0)
-        return state, RuleOutput(float(values.max()), 1.0, fault, (), ranking)
+        return state, RuleOutput(largest, 1.0, fault, (), ranking)
 
     def _followed(
         self, state: LearnedState, observation: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
