@@ -185,6 +185,40 @@ def test_other_constraints_and_objectives_share_the_variables():
     assert 1.46 < gamma < 1.6001
 
 
+def test_constraints_without_a_name_are_added_to_those_there():
+    paper = EACH["filasova 1"]()
+    Z = paper.variables["Z"]
+    changed = paper.changed(constraints=[Z[0, 0] == 0.0]).changed(constraints=lambda v: [v["Z"][0, 1] == 0.0])
+    assert list(changed.constraints)[-2:] == ["own 1", "own 2"]
+    changed.problem.solve(solver="CLARABEL")
+    assert np.abs(Z.value[0]).max() < 1e-8 < np.abs(Z.value[1:]).max()
+    assert changed.design().report.passed
+
+
+def test_values_of_another_problem_are_not_those_of_a_changed_one():
+    paper = EACH["filasova 1"]()
+    paper.problem.solve(solver="CLARABEL")
+    assert paper.design().report.passed
+    for changed in (
+        paper.changed(constraints=lambda v: [v["Z"][0, 0] == 0.0]),
+        paper.changed(objective=lambda v: cp.trace(v["P1"])),
+    ):
+        for take in (changed.gains, changed.design):
+            with pytest.raises(SpecError, match="changed and not solved since"):
+                take()
+
+
+def test_values_that_violate_an_own_constraint_are_no_design():
+    paper = EACH["filasova 1"]()
+    changed = paper.changed(constraints=lambda v: [v["Z"][0, 0] == 0.0])
+    changed.problem.solve(solver="CLARABEL")
+    assert changed.design().report.passed
+    paper.problem.solve(solver="CLARABEL")  # the variables are shared
+    assert abs(paper.variables["Z"].value[0, 0]) > 1e-3
+    with pytest.raises(obsynth.SolverError, match=r"your constraint 1, Z\[0, 0\] == 0.0 \(by"):
+        changed.design()
+
+
 def test_a_structured_gain_keeps_its_zeros():
     found = EACH["filasova 1"]()
     Z, Y = found.variables["Z"], found.variables["Y"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 #: Whom a bisection asks where Clarabel has no answer, and within how many steps: where SCS refutes (45) at four states,
 #: hundreds suffice, and next to the least level no number does.
 SECOND_OPINION: tuple[str, Mapping[str, Any]] = ("SCS", {"max_iters": 5000})
+
+#: How names begin of constraints that a user gives without one; a number follows.
+OWN = "own "
 
 #: Numbers by name, such as the values of variables.
 Values = Mapping[str, FloatArray]
@@ -70,6 +73,8 @@ class Conditions:
     _gains: Callable[[Values], dict[str, FloatArray]]
     _design: Callable[[dict[str, FloatArray], str], ObserverDesign]
     weight: Any = None
+    _added: frozenset[str] = frozenset()  # names of the constraints by which these conditions have been changed
+    _values_before: Mapping[str, Any] = field(default_factory=dict)  # of the variables, when they were changed
 
     def __post_init__(self) -> None:
         data = {name: read_only(value) for name, value in self.data.items()}
@@ -89,10 +94,11 @@ class Conditions:
         Raises
         ------
         SpecError
-            A variable has no value yet.
+            A variable has no value yet, or these conditions have been `changed` and not solved since.
         SolverError
             The solver left none, or the values do not determine the gains.
         """
+        self._require_solved_since()
         used = set(self.problem.variables())
         values = {name: self._value(name, variable) for name, variable in self.variables.items() if variable in used}
         try:
@@ -114,13 +120,15 @@ class Conditions:
         Raises
         ------
         SpecError, SolverError
-            As for `gains`.
+            As for `gains`; the values do not satisfy a constraint that `changed` has added.
         PreconditionError
             No such observer exists for this plant.
         VerificationError
             The gains fail a check, which is named.
         """
-        design = self._design(self.gains(), name)
+        gains = self.gains()
+        self.require_satisfied(self._added)
+        design = self._design(gains, name)
         if not design.report.passed:
             raise VerificationError(
                 f"The gains of this solution fail: {failed_rows(design.report)}. Solve to more digits, or leave more "
@@ -128,6 +136,29 @@ class Conditions:
                 report=design.report,
             )
         return design.replace(solver={**design.solver, "conditions": self.source, "status": str(self.problem.status)})
+
+    def require_satisfied(self, names: Iterable[str]) -> None:
+        """Raise where the present values do not satisfy constraints: what verifies a design knows the paper's alone.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Names of constraints.
+
+        Raises
+        ------
+        SolverError
+            One is violated by more than solvers leave.
+        """
+        room = VIOLATION_SHARE * self._size_of_values()
+        for name in sorted(names):
+            violation = float(np.max(self.constraints[name].violation(), initial=0.0))
+            if not violation <= room:
+                raise SolverError(
+                    f"The values of {', '.join(self.variables)} do not satisfy {_called(name)}, "
+                    f"{self.constraints[name]} (by {violation:.3g}): solve the problem, problem.solve(), or to more "
+                    "digits where it has been solved."
+                )
 
     def solve(self, solver: str, settings: Mapping[str, Any]) -> None:
         """Solve the problem; whatever the solver does ends in values, in a status, or in a `SolverError`.
@@ -257,7 +288,7 @@ class Conditions:
         values = [variable.value for variable in self.problem.variables()]
         if any(value is None or not np.all(np.isfinite(value)) for value in values):
             return "unknown"
-        size = max((float(np.max(np.abs(value), initial=1.0)) for value in values), default=1.0)
+        size = self._size_of_values()
         worst = max(
             (float(np.max(constraint.violation(), initial=0.0)) for constraint in self.problem.constraints), default=0.0
         )
@@ -285,7 +316,8 @@ class Conditions:
         Parameters
         ----------
         constraints : iterable or mapping of cvxpy.Constraint, or callable, optional
-            Added; one of a name that is there already replaces it.  A function takes `letters` and returns them.
+            Added; one of a name that is there already replaces it, and those without a name are ``own 1``, ``own 2``
+            and so on.  A function takes `letters` and returns them.
         drop : iterable of str, optional
             Names of constraints to leave out.
         objective : cvxpy.Minimize, cvxpy.Maximize, cvxpy.Expression or callable, optional
@@ -304,11 +336,35 @@ class Conditions:
             )
         remaining = {key: value for key, value in self.constraints.items() if key not in set(drop)}
         added = constraints(self.letters()) if callable(constraints) else constraints
-        remaining |= named_constraints(added, len(remaining))
+        new = named_constraints(added, sum(name.startswith(OWN) for name in remaining))
+        remaining |= new
         goal = self.problem.objective
         if objective is not None:
             goal = checked_objective(objective(self.letters()) if callable(objective) else objective)
-        return replace(self, problem=lmi.semidefinite_problem(goal, list(remaining.values())), constraints=remaining)
+        return replace(
+            self,
+            problem=lmi.semidefinite_problem(goal, list(remaining.values())),
+            constraints=remaining,
+            _added=(self._added | set(new)) & set(remaining),
+            _values_before={name: variable.value for name, variable in self.variables.items()},
+        )
+
+    def _require_solved_since(self) -> None:
+        """Raise where the variables, which changed conditions share, still have the values of before the change."""
+        before = {name: value for name, value in self._values_before.items() if value is not None}
+        if self.problem.status is None and before:
+            now = {name: self.variables[name].value for name in before}
+            if all(now[name] is not None and np.array_equal(now[name], before[name]) for name in before):
+                raise SpecError(
+                    "These conditions have been changed and not solved since: the variables have the values that they "
+                    "had before. Solve the problem first, problem.solve().",
+                    path="problem",
+                )
+
+    def _size_of_values(self) -> float:
+        """Return the size of the largest entry of the variables, at least one."""
+        values = [variable.value for variable in self.problem.variables()]
+        return max((float(np.max(np.abs(value), initial=1.0)) for value in values), default=1.0)
 
     def _value(self, name: str, variable: Any) -> FloatArray:
         value = variable.value
@@ -362,8 +418,13 @@ class Letters(dict[str, Any]):
         )
 
 
+def _called(name: str) -> str:
+    """Return how a message calls a constraint of the user."""
+    return f"your constraint {name.removeprefix(OWN)}" if name.startswith(OWN) else f"the constraint {name!r}"
+
+
 def named_constraints(constraints: Any, count: int = 0) -> dict[str, Any]:
-    """Return constraints by name, the others numbered; raise `SpecError` for what is none."""
+    """Return constraints by name, the others numbered after ``count``; raise `SpecError` for what is none."""
     from cvxpy.constraints.constraint import Constraint
 
     if isinstance(constraints, Constraint):
@@ -373,14 +434,14 @@ def named_constraints(constraints: Any, count: int = 0) -> dict[str, Any]:
     pairs = (
         dict(constraints)
         if isinstance(constraints, Mapping)
-        else {f"own {i + 1}": part for i, part in enumerate(constraints)}
+        else {f"{OWN}{i}": part for i, part in enumerate(constraints, count + 1)}
     )
     for name, part in pairs.items():
         expected = "cvxpy constraints, such as P >> numpy.eye(n)"
         require_kind(part, Constraint, f"Constraint {name!r}", expected, path="constraints")
         if not part.is_dcp():
-            who = f"Your constraint {name.removeprefix('own ')}" if name.startswith("own ") else f"Constraint {name!r}"
-            raise SpecError(f"{who} is not convex: {part}", path="constraints")
+            called = _called(name)
+            raise SpecError(f"{called[0].upper()}{called[1:]} is not convex: {part}", path="constraints")
     return pairs
 
 

@@ -84,7 +84,8 @@ def filter_by_inequality(
         drop = ("(45)",) if method.gamma is None else ()
     elif method.objective is not None:
         goal = method.objective(problem.letters())
-    problem = problem.changed(constraints=_with_own(method, problem, added), objective=goal, drop=drop)
+    own = _own_constraints(method, problem)
+    problem = problem.changed(constraints={**added, **own}, objective=goal, drop=drop)
     progress("solving the matrix inequality")
     runs = [_solved(problem, method)]
     if goal is None and plant.nd:
@@ -93,6 +94,7 @@ def filter_by_inequality(
         level = (1.0 + method.gamma_margin) * least if method.gamma is None else method.gamma
         problem = problem.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
         runs.append(_solved(problem, method))
+    problem.require_satisfied(own)
     gains = problem.gains()
     work = with_sensor_faults_as_states(plant)
     _require_inside(gains["T"] @ work.A - gains["L"] @ work.C, where)
@@ -147,9 +149,11 @@ def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: C
         delta = _fitting_delta(default_delta(plant if form is None else form.plant, method, decay), where)
     problem = theorem(plant, delta=delta, decay=decay, region=where)
     goal = None if method.objective is None else method.objective(problem.letters())
-    problem = problem.changed(constraints=_with_own(method, problem, {}), objective=goal)
+    own = _own_constraints(method, problem)
+    problem = problem.changed(constraints=own, objective=goal)
     progress("solving the matrix inequality")
     runs = [_solved(problem, method)]
+    problem.require_satisfied(own)
     gains = problem.gains()
     A_o, C_o = problem.data["A_o"], problem.data["C_o"]
     J, L = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
@@ -170,9 +174,11 @@ def ui_pi_by_inequality(plant: DescriptorSystem, method: UiPiObserver, *, progre
         plant, fault_model=method.fault_model, region=where, E_sharp=method.E_sharp, C_sharp=method.C_sharp, G=method.G
     )
     goal = method.objective(problem.letters()) if callable(method.objective) else None
-    problem = problem.changed(constraints=_with_own(method, problem, {}), objective=goal)
+    own = _own_constraints(method, problem)
+    problem = problem.changed(constraints=own, objective=goal)
     progress("solving the matrix inequality")
     runs = [_solved(problem, method)]
+    problem.require_satisfied(own)
     gains = problem.gains()
     _require_inside(gains["Ahat"], where)
     progress("building the realisation and its certificate")
@@ -192,10 +198,9 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
     return float(1.0 / inside[np.argmin(np.abs(np.log(inside * delta)))]) if len(inside) else delta
 
 
-def _with_own(method: Any, problem: Conditions, added: Mapping[str, Any]) -> dict[str, Any]:
-    """Return constraints to add, those of the user among them."""
-    own = {} if method.constraints is None else named_constraints(method.constraints(problem.letters()))
-    return {**added, **own}
+def _own_constraints(method: Any, problem: Conditions) -> dict[str, Any]:
+    """Return the constraints that the user has added, by name."""
+    return {} if method.constraints is None else named_constraints(method.constraints(problem.letters()))
 
 
 def _region_of_poles(method: UiPiObserver, dt: float) -> LMIRegion | None:
