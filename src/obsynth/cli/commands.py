@@ -17,8 +17,9 @@ from obsynth.files.outputs import write_atomically
 from obsynth.methods.registry import AUTO
 from obsynth.numerics.libraries import failure_of
 from obsynth.report.terminal.arguments import refuse_given
-from obsynth.report.terminal.output import emit, print_json, progress, stdout_console
+from obsynth.report.terminal.output import emit, print_json, stdout_console
 from obsynth.report.terminal.specs import prepared, spec_output
+from obsynth.report.terminal.stages import progress
 from obsynth.results.calibration_files import CALIBRATION_KIND, box_row, verify_calibration
 from obsynth.results.certificate_files import ALARM_KIND, RESULTS, kind_of_file
 from obsynth.results.gain_set_writing import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored

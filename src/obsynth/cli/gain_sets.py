@@ -9,7 +9,8 @@ import obsynth
 from obsynth.errors import VerificationError
 from obsynth.files.outputs import require_distinct
 from obsynth.report.terminal.arguments import numbers_of, refuse_given
-from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, progress, verified_again
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, verified_again
+from obsynth.report.terminal.stages import progress
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.results.design import unverified_mark
 

@@ -33,6 +33,7 @@ from obsynth.report.terminal.arguments import (
     settings_of,
 )
 from obsynth.report.terminal.output import print_error, print_json
+from obsynth.report.terminal.stages import watched_stages
 from obsynth.report.terminal.verbs import Verb
 from obsynth.version import __version__
 
@@ -292,7 +293,10 @@ def _outcome(options: argparse.Namespace) -> int:
         is_written = options.verb == "design" or any(getattr(options, name, None) not in (None, "-") for name in named)
         if getattr(options, "force", False) and not is_written:
             raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
-        return VERBS[options.verb].run(options)
+        # A run on a log that grows says itself that it is alive.
+        is_followed = getattr(options, "follow", None) is not None
+        with watched_stages(options.verb, quiet=getattr(options, "quiet", False) or is_followed):
+            return VERBS[options.verb].run(options)
     except ObsynthError as error:
         failure = error
     except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:

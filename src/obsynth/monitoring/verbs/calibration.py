@@ -12,7 +12,8 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.verbs.data_arguments import with_input_delay
 from obsynth.plants.noise import offset_state
 from obsynth.report.terminal.arguments import columns_of, numbers_of, pair, refuse_given
-from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, progress
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file
+from obsynth.report.terminal.stages import progress
 from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
 from obsynth.results.gain_set_writing import plain
 from obsynth.specs.loader import load_model, load_plant

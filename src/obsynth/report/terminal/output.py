@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,20 +110,3 @@ def stdout_console() -> Console:
             raise BrokenPipeError
 
     return ReportConsole(markup=False, highlight=False, emoji=False)
-
-
-@contextmanager
-def progress(*, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show the stages of a long run on stderr."""
-    if quiet:
-        yield lambda text: None
-        return
-    if not sys.stderr.isatty():
-        begin = time.monotonic()
-        yield lambda text: print(f"[{time.monotonic() - begin:5.1f} s] {text}", file=sys.stderr, flush=True)
-        return
-    from rich.console import Console
-    from rich.text import Text
-
-    with Console(stderr=True).status(Text("reading")) as status:
-        yield lambda text: status.update(Text(text))

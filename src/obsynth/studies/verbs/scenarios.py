@@ -13,9 +13,10 @@ from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
 from obsynth.monitoring.verbs.data_arguments import monitor_settings, stated_delay
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.report.terminal.arguments import columns_of, flag_of, numbers_of, refuse_given
-from obsynth.report.terminal.output import emit, output_file, progress, stdout_console
+from obsynth.report.terminal.output import emit, output_file, stdout_console
 from obsynth.report.terminal.pictures import picture_kind, written_picture
 from obsynth.report.terminal.specs import prepared
+from obsynth.report.terminal.stages import progress
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.studies.verbs.sweeps import chosen_executor
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.report.terminal.arguments import refuse_given
-from obsynth.report.terminal.output import emit, progress, stdout_console
+from obsynth.report.terminal.output import emit, stdout_console
+from obsynth.report.terminal.stages import progress
 
 
 def run_sensors(options: argparse.Namespace) -> int:

@@ -19,7 +19,8 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.monitoring.verbs.arguments import MONITOR_NAMES
 from obsynth.numerics.suggestions import there_are
 from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
-from obsynth.report.terminal.output import output_file, print_json, progress, stdout_console
+from obsynth.report.terminal.output import output_file, print_json, stdout_console
+from obsynth.report.terminal.stages import progress
 from obsynth.specs.documents import read_yaml
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
