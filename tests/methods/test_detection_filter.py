@@ -81,6 +81,20 @@ def test_units_decide_nothing(seed: int) -> None:
     assert there["fault_sensitivity"] == pytest.approx(here["fault_sensitivity"], rel=1e-6)
 
 
+@pytest.mark.parametrize("time", [1.0, 2.0**-30, 2.0**30])
+def test_the_band_follows_the_unit_of_time(time: float) -> None:
+    # It ended at 1000 rad/s: a plant of minutes had a sensitivity of nothing there, one of microseconds that of rest.
+    system = plant(1)
+    other = system.replace(**{name: time * getattr(system, name) for name in ("A", "Bf", "Bd", "Bw")})
+    here, there = obsynth.detection_filter(system), obsynth.detection_filter(other)
+    fastest = np.max(np.abs(np.linalg.eigvals(system.A - here.observer.By @ system.C)))
+    assert here.band == pytest.approx((0.0, fastest), rel=1e-9)
+    assert there.band == pytest.approx((0.0, fastest * time), rel=1e-9)
+    assert there.report.passed
+    if time == 1.0:
+        assert there.fault_sensitivity == here.fault_sensitivity > 0.0
+
+
 @pytest.mark.parametrize("time", [1.0, 2.0**-9])
 @pytest.mark.long
 def test_a_gain_is_proved_wherever_noise_drives_every_state(time: float) -> None:
@@ -313,7 +327,7 @@ def test_sensitivity_is_proved_far_beyond_the_rates_of_a_plant() -> None:
     spec = obsynth.load_spec(Path(__file__).parents[2] / "docs/examples/thermal/spec.yaml")
     assert spec.transformation is not None
     oven = spec.transformation.source
-    found = obsynth.detection_filter(oven)
+    found = obsynth.detection_filter(oven, band=(0.0, 1e3))
     system, observer = found.plant, found.observer
     shown = [
         np.linalg.svd(observer.Dy @ transfer(system, observer.By, system.Bf, system.Df, w), compute_uv=False)

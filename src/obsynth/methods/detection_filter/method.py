@@ -30,7 +30,8 @@ class DetectionFilterMethod(Method):
         Continuous time, index 0 or 1, detectable; unknown inputs and noise together reach every output directly
         (``[Dd, Dw]`` of full row rank), noise counting as an unknown input of its deviation.
     band : sequence of float, optional, rad/s
-        Lowest and highest frequency at which the faults must show.
+        Lowest and highest frequency at which the faults must show; by default from zero to that of the filter's fastest
+        mode.  The filter is the same for every band, and `fault_sensitivity` is that of the band.
     name : str, optional
         Name of the design.
 
@@ -100,10 +101,12 @@ class DetectionFilterMethod(Method):
     }
     witnesses: ClassVar[frozenset[str]] = frozenset({"P"})
 
-    band: Annotated[Any, WrittenAs("pair")] = (0.0, 1e3)
+    band: Annotated[Any, WrittenAs("pair")] = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
+        if self.band is None:
+            return
         listed = list(self.band) if isinstance(self.band, (list, tuple, np.ndarray)) else []
         if len(listed) != 2 or not all(map(is_finite_number, listed)) or not 0.0 <= listed[0] < listed[1]:
             yield f"band is {self.band!r}: give the lowest and the highest frequency in rad/s."

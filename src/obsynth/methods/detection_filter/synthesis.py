@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,7 +84,7 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
             "the outputs near the imaginary axis do that, and noise that hardly reaches some states: state noise of "
             "the states (Bw)."
         )
-    low, high = (float(value) for value in method.band)
+    low, high = _band(observer) if method.band is None else (float(value) for value in method.band)
     least, where = _sensitivity(smooth, observer, low, high)
     reached = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
     levels = [least * (1.0 - margin) for margin in SENSITIVITY_MARGINS]
@@ -96,13 +96,18 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
         "frequency": where,
     }
     return Synthesis(
-        method.as_plain(),
+        replace(method, band=[low, high]).as_plain(),
         {"L": gain, "V": weight},
         observer,
         Certificate({"P": witness}, claims),
         notes=_notes(smooth, observer, claims),
         transformation=elimination if elimination.description else None,
     )
+
+
+def _band(observer: LinearObserver) -> tuple[float, float]:
+    """Return the band from zero to the fastest mode of a filter; where it has none all frequencies are alike."""
+    return 0.0, float(np.max(np.abs(np.linalg.eigvals(observer.Az)), initial=0.0)) or 1.0
 
 
 def _first_proved(levels: Sequence[float], is_proved: Callable[[float], bool]) -> float:
