@@ -93,6 +93,16 @@ def test_arrays_and_names() -> None:
         ("2j", "not allowed"),
         ("1 # 2", "'#' is not allowed"),
         ("2 ^ 3", "written **"),
+        ("pow(k, 2)", "written **"),
+        ("2k + 1", "A product is written with *"),
+        ("2.5e-3 (k + 1)", "A product is written with *"),
+        ("(k + 1)(k + 2)", "A product is written with *"),
+        ("ln(k)", "The natural logarithm is log(x)."),
+        ("arctan(k)", "asin, acos and atan"),
+        ("atan2(k, 1)", "2 * atan(y / (sqrt(x**2 + y**2) + x))"),
+        ("saturation(k, 0, 1)", "min(max(x, low), high)"),
+        ("interp(k, 0, 1)", "a + b * max(x - c, 0)"),
+        ("Piecewise(k, 1)", "where(a > b, c, d)"),
         ("sin(*k)", "not allowed"),
         ("sin(x=1)", "not allowed"),
         ("k, 1", "not allowed"),
@@ -112,6 +122,22 @@ def test_arrays_and_names() -> None:
 def test_what_is_no_arithmetic_is_refused(text: str, part: str) -> None:
     with pytest.raises(SpecError, match=re.escape(part)):
         parse_expression(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["1e-3 * k + foo(k)", "2.5E6 * foo(k)", "foo(k) + (1 if k > 2 else 3)", "0.5 * (k + 1) * foo(k) - max(k, 1) / 3"],
+)
+def test_a_product_is_advised_only_where_one_is_missing(text: str) -> None:
+    with pytest.raises(SpecError, match="is not a valid expression") as told:
+        parse_expression(text)
+    assert "A product" not in str(told.value)
+
+
+def test_the_angle_that_is_advised_is_the_angle() -> None:
+    angle = parse_expression("2 * atan(y / (sqrt(x**2 + y**2) + x))")
+    for x, y in ((1.0, 2.0), (-1.0, 0.5), (-3.0, -1.0), (0.0, -2.0)):
+        assert angle({"x": np.float64(x), "y": np.float64(y)}) == pytest.approx(np.arctan2(y, x), rel=1e-12)
 
 
 def test_what_is_not_finite_is_left_to_the_caller_without_a_warning() -> None:

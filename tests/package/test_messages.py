@@ -109,6 +109,8 @@ def test_a_name_that_is_like_no_other_is_told_what_there_is() -> None:
         ("area * d(level) = inflow", "A derivative in an equation is written der(x)."),
         ("area * level' = inflow", "A derivative in an equation is written der(x)."),
         ("area * der(level) == inflow", "An equation has a single =."),
+        ("area * dlevel/dt = inflow", "A derivative in an equation is written der(x)."),
+        ("der(level) = sin(t)", "What depends on time by itself is an input: a column of the log."),
     ],
 )
 def test_how_an_equation_is_written_is_told_where_it_is_not(equation: str, said: str) -> None:

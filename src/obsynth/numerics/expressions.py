@@ -27,8 +27,30 @@ Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
-#: How derivatives are often written.
-_DERIVATIVES = re.compile(r"\b(?:d|dt|ddt|dot|diff|deriv|derivative|Der|D)\(|'\s*(?:$|[-+*/=])")
+#: How other languages write things, and what to write here.
+_OTHER_SPELLINGS: Sequence[tuple[re.Pattern[str], str]] = (
+    (re.compile(r"\^|\bpow(?:er)?\("), "A power is written **."),
+    (re.compile("=="), "An equation has a single =."),
+    (
+        re.compile(r"\b(?:d|dt|ddt|dot|diff|deriv|derivative|Der|D)\(|'\s*(?:$|[-+*/=])"),
+        "A derivative in an equation is written der(x).",
+    ),
+    (
+        re.compile(r"(?:(?<![\w.])[\d.]+(?:[eE][+-]?\d+)?(?![eE][+-]?\d)|\))\s*(?!(?:if|else|and|or)\b)[A-Za-z_(]"),
+        "A product is written with *, as 2 * x.",
+    ),
+    (re.compile(r"\bln\("), "The natural logarithm is log(x)."),
+    (re.compile(r"\barc(?:sin|cos|tan)\("), "Inverse functions are asin, acos and atan."),
+    (re.compile(r"\batan2\("), "The angle of (x, y) is 2 * atan(y / (sqrt(x**2 + y**2) + x))."),
+    (re.compile(r"\bfabs\("), "The absolute value is abs(x)."),
+    (re.compile(r"\b(?:heaviside|Heaviside)\("), "step(x) is 1 from zero on and 0 before."),
+    (re.compile(r"\b(?:clip|sat|saturate|saturation)\("), "A limited value is min(max(x, low), high)."),
+    (re.compile(r"\b(?:interp|interp1|interp1d|lookup|table)\("), "A table is a sum of pieces: a + b * max(x - c, 0)."),
+    (
+        re.compile(r"\b(?:if|else|and|or|not)\b|\bPiecewise\(|[<>]"),
+        "To decide, write where(a > b, c, d): c where a > b, d elsewhere.",
+    ),
+)
 
 #: Names have a prefix where Python's grammar reads them, so that its own words may be names as well.
 _NAME_IN_TEXT = re.compile(r"(?<![\w.])[A-Za-z_]\w*", re.ASCII)
@@ -153,12 +175,7 @@ class _Reader:
         self.prefixed = _NAME_IN_TEXT.sub(rf"{_NAME_PREFIX}\g<0>", plain)
 
     def error(self, reason: str) -> SpecError:
-        decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
-        is_conditional = DECIDING_WORDS.intersection(_NAME_IN_TEXT.findall(self.text)) or re.search("[<>]", self.text)
-        power = " A power is written **." if "^" in self.text else ""
-        power += " An equation has a single =." if "==" in self.text else ""
-        power += " A derivative in an equation is written der(x)." if _DERIVATIVES.search(self.text) else ""
-        advice = power + (decides if is_conditional else "")
+        advice = "".join(f" {sentence}" for spelling, sentence in _OTHER_SPELLINGS if spelling.search(self.text))
         return SpecError(
             f"{self.text!r} is not a valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
             f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{advice}"

@@ -18,6 +18,9 @@ from obsynth.plants.dae_fields import DAEFields
 #: The sign between two sides, which is no part of a comparison.
 EQUALS = re.compile("(?<![<>=])=(?!=)")
 
+#: How the time is called elsewhere, and how Leibniz writes a derivative.
+_TIMES, _LEIBNIZ = ("t", "time", "Time"), re.compile(r"\bd\w+\s*/\s*dt\b")
+
 
 @dataclass(frozen=True, eq=False)
 class DAESymbols:
@@ -111,10 +114,18 @@ def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
     if unknown:
         raise SpecError(
             f"{path}: {expression.text!r} uses {', '.join(map(repr, unknown))}, which is no state, input, parameter, "
-            f"constant or earlier definition; {there_are(unknown[0], (n for n in known if 'der(' not in n))}",
+            f"constant or earlier definition; {there_are(unknown[0], (n for n in known if 'der(' not in n))}"
+            f"{_advice(expression.text, unknown)}",
             path=path,
         )
     return symbolic_value(expression, known)
+
+
+def _advice(text: str, unknown: Sequence[str]) -> str:
+    """Return what to write for a derivative or for the time, as a sentence, where a text seems to mean one."""
+    if any(name in _TIMES for name in unknown):
+        return " What depends on time by itself is an input: a column of the log."
+    return " A derivative in an equation is written der(x)." if _LEIBNIZ.search(text) else ""
 
 
 def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
