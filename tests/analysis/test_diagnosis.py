@@ -11,7 +11,7 @@ from networks import random_network
 import obsynth
 from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decoupled_fault
-from obsynth.analysis.diagnosis.explanations import hidden_motion, hiding_amplitudes
+from obsynth.analysis.diagnosis.hidden_motions import hidden_motion, hiding_amplitudes
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
 from obsynth.numerics.ranks import TRACE_TOLERANCE, decide_rank
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.explanations import state_sensors, with_sensors
+from obsynth.analysis.diagnosis.candidate_sensors import state_sensors, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.specs.loader import load_spec

@@ -15,7 +15,7 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.plants.descriptor import DescriptorSystem
 
 if TYPE_CHECKING:
-    from obsynth.analysis.diagnosis.explanations import Sensor
+    from obsynth.analysis.diagnosis.candidate_sensors import Sensor
 
 #: Plants with more states are not searched for pairs, and those with more still not at all.
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
@@ -62,7 +62,7 @@ def with_advice(
     """Return the refusal with what would help at its end; as it is where the existence conditions hold.
 
     ``sensors``: those to try, by default one for each state; ``notes``: what was done to the plant before."""
-    from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
+    from obsynth.analysis.diagnosis.candidate_sensors import least_additions, listed_sets, state_sensors
 
     def holds(plant: DescriptorSystem, method: Method = method) -> bool:
         # What would help is a suggestion, not proved: the tried plant is decided exactly then.

@@ -22,7 +22,7 @@ from obsynth.plants.transformations.index_reduction import improper_outputs, wit
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation
 
 if TYPE_CHECKING:
-    from obsynth.analysis.diagnosis.explanations import Sensor
+    from obsynth.analysis.diagnosis.candidate_sensors import Sensor
 
 #: Options whose values belong to the states and equations as written.
 _OF_STATES_AS_WRITTEN = ("Q", "initial_state", "initial_covariance", "state_bounds")
@@ -46,7 +46,7 @@ class WorkingPlant:
     def sensors(self) -> tuple[Sensor, ...] | None:
         """Return a sensor for each state as written that a reduced plant still has; ``None`` where it was not
         reduced."""
-        from obsynth.analysis.diagnosis.explanations import recovered_sensors
+        from obsynth.analysis.diagnosis.candidate_sensors import recovered_sensors
 
         if not self.reduced or self.recovery is None or not isinstance(self.plant, DescriptorSystem):
             return None

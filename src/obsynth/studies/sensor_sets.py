@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge
 
+from obsynth.analysis.diagnosis.candidate_sensors import Sensor, state_sensors
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
-from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import SensorSearch, Task, reached
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table

@@ -8,7 +8,7 @@ from itertools import combinations
 from math import comb
 from typing import Any
 
-from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
+from obsynth.analysis.diagnosis.candidate_sensors import Sensor, with_sensors
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_test
 from obsynth.plants.descriptor import DescriptorSystem

@@ -1,4 +1,4 @@
-"""From a plant to what can be diagnosed on it."""
+"""Diagnosability of the faults of a plant: whether each can be detected, isolated and estimated, and why not."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decided_exactly
-from obsynth.analysis.diagnosis.explanations import (
+from obsynth.analysis.diagnosis.candidate_sensors import (
     SENSOR_PAIRS_UP_TO,
     SENSOR_SEARCH_UP_TO,
     Sensor,
-    hidden_motion,
     least_additions,
     listed_sets,
     state_sensors,
 )
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decided_exactly
 from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal, dc_point, others
+from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
 from obsynth.analysis.diagnosis.margins import fault_margins
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import MOST_PATTERN_FAULTS, Diagnosis, FaultDiagnosis, residual_bank
@@ -35,16 +35,16 @@ from obsynth.plants.pencil import structure_of
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
 
-#: Of more faults the whole bank is refused: 4095 sets are asked about for this many.
+#: The whole bank of residuals is refused for plants with more faults: it decides 2^12 - 1 = 4095 sets of this many.
 MOST_FAULTS_OF_WHOLE_BANK = 12
 
-#: States that could be measured times faults: with more, what would help is not searched here.
+#: Candidate sensors times faults: above this number no further sensors are suggested.
 MOST_ADDITIONS = 300
 
-#: Zeros that are named in a sentence; the others are counted.
+#: Blocking zeros with a sentence of their own; further ones are only counted.
 MOST_ZEROS = 4
 
-_PART_OF_THE_BANK = (
+_INCOMPLETE_BANK_NOTE = (
     "Of {count} faults, the residuals listed see all faults, all but one, or one alone; others may exist. "
     "diagnose(..., whole_bank=True) and obsynth check --whole-bank list all of up to 12 faults."
 )
@@ -62,25 +62,27 @@ def diagnose(
     whole_bank: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Decide for each fault whether it can be detected, distinguished from the others, and estimated; and if not, why.
+    """Decide for each fault whether it can be detected, isolated from the others and estimated, and explain why not.
 
-    The answers hold for any unknown inputs and initial state, for descriptor plants of any index, continuous or not.
-    Small plants whose numbers are as somebody wrote them are decided over the rational numbers; all others in floating
-    point, in units that do not depend on those of the data, with the gap behind each decision.
+    The answers hold for all unknown inputs and initial states, and for descriptor plants of any index in continuous
+    and discrete time.  Small plants whose numbers are stated, not computed, are decided in rational arithmetic.  All
+    others are decided in floating point, in units that do not depend on those of the data, and each decision reports
+    the gap between the singular values that it separates.
 
     Parameters
     ----------
     plant : DescriptorSystem or Transformation
-        ``E, A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd`` allowed.  Where ``sE - A`` is
-        not regular, the verdicts are about all trajectories that satisfy the equations, and a warning says so.
+        ``E, A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``Df`` and ``Dd`` may be nonzero.  Where
+        ``sE - A`` is not regular, the verdicts are about all trajectories that satisfy the equations, and a warning
+        says so.
     fault_model : str, mapping or FaultModel, optional
-        How faults run, as for `ui_pi_observer`: it decides `model_estimable`.
+        Model of the faults over time, as for `ui_pi_observer`; it decides `model_estimable`.
     frequencies : sequence of float, optional, rad/s
-        Where to ask whether a sinusoidal fault leaves a trace.
+        Frequencies at which to decide whether a sinusoidal fault shows in a residual.
     suggest : bool, optional
-        Look for states that would help where a fault cannot be estimated.
+        Search for further sensors where a fault cannot be estimated.
     whole_bank : bool, optional
-        List every structured residual that exists of up to 12 faults; that is always done for six.
+        List every structured residual that exists, for up to 12 faults; for up to six faults all are always listed.
     progress : callable, optional
         Called with a text at the start of each stage.
 
@@ -100,7 +102,7 @@ def diagnose(
     References
     ----------
     .. [Varga] A. Varga, Solving Fault Diagnosis Problems, Springer 2017: fault detectability, weak and strong, and
-       isolability.  Here all of it is read from one reduction of a pencil, and decided exactly where that can be.
+       isolability.  Here one reduction of a pencil decides all of these, exactly where the numbers allow it.
 
     Examples
     --------
@@ -108,8 +110,8 @@ def diagnose(
     >>> plant = obsynth.DescriptorSystem(
     ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
     ... )
-    >>> found = obsynth.diagnose(plant)
-    >>> [(fault.name, fault.detectable) for fault in found.faults]
+    >>> diagnosis = obsynth.diagnose(plant)
+    >>> [(fault.name, fault.detectable) for fault in diagnosis.faults]
     [('f1', True)]
     """
     plant = linear_plant(plant)
@@ -145,7 +147,7 @@ def diagnose(
         for i, fault in enumerate(faults)
     )
     bank = residual_bank(decoupled, whole_bank)
-    part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
+    part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_INCOMPLETE_BANK_NOTE.format(count=plant.nf),)
     return Diagnosis(
         faults,
         weak,
@@ -160,7 +162,7 @@ def diagnose(
 
 
 def model_points(model: Exosystem, fault: int) -> list[complex]:
-    """Return the eigenvalues of the part of the exosystem that a fault is made of."""
+    """Return the eigenvalues of the part of the exosystem that drives a fault."""
     reached = model.Cw[fault] != 0.0
     for _ in range(len(reached)):
         reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
@@ -207,7 +209,7 @@ def _sentences(
     for_isolation: DecoupledFault,
     candidates: _Candidates | None,
 ) -> list[str]:
-    """Return what hides a fault, at which point, and what would help."""
+    """Return sentences that say what hides a fault, at which point of the plane, and which sensors would help."""
     name, at_rest = plant.fault_names[for_detection.number], dc_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
     step, texts = for_isolation.shows_at_rest, []
@@ -249,7 +251,7 @@ def _sentences(
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """States that could be measured, and what they show at generic points: of most sets that is enough to refuse."""
+    """Candidate sensors, one for each state, with their responses at generic points, which rule out most sets."""
 
     plant: DescriptorSystem
 
@@ -258,8 +260,8 @@ class _Candidates:
         return state_sensors(self.plant)
 
     @property
-    def searched(self) -> str:
-        """Which additions are searched, in words; empty where none are: each is asked anew for each fault."""
+    def search_scope(self) -> str:
+        """Which additions are searched, in words; empty where a search for each fault would take too long."""
         if self.plant.nx > SENSOR_SEARCH_UP_TO or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
             return ""
         return "state" if self.plant.nx > SENSOR_PAIRS_UP_TO else "state or pair of states"
@@ -269,31 +271,36 @@ class _Candidates:
         return SensorResponses.of(self.plant, self.sensors)
 
     def additions(
-        self, fault: int, beside: Sequence[int], reached: Callable[[DescriptorSystem], bool]
+        self, fault: int, decoupled: Sequence[int], is_enough: Callable[[DescriptorSystem], bool]
     ) -> tuple[tuple[str, ...], ...]:
-        """Return the least sets that reach something for which a fault has to show, free of those ``beside``."""
+        """Return the smallest sets of sensors with which the plant passes the test ``is_enough``.
+
+        The plant passes only if the fault shows in residuals that are decoupled from the faults ``decoupled``.
+        """
 
         def promising(sets: NDArray[np.int64]) -> NDArray[np.bool_]:
-            return np.ones(len(sets), bool) if responses is None else responses.shows(sets, fault, beside) > 0.0
+            return np.ones(len(sets), bool) if responses is None else responses.shows(sets, fault, decoupled) > 0.0
 
-        if not self.searched:
+        if not self.search_scope:
             return ()
         responses = self.responses
-        return least_additions(self.plant, self.sensors, reached, promising=promising)
+        return least_additions(self.plant, self.sensors, is_enough, promising=promising)
 
 
 def _suggestion(candidates: _Candidates, name: str, for_detection: DecoupledFault, *, step: bool) -> list[str]:
-    """Return which states to measure, computed; and those that would only show the fault."""
+    """Return sentences that name the states to measure, and those with which the fault is detectable only."""
     plant, fault = candidates.plant, for_detection.number
     other_faults = others(plant, fault)
     cached: dict[tuple[str, ...], DecoupledFault] = {}
 
-    def free(changed: DescriptorSystem) -> DecoupledFault:
+    def isolated(changed: DescriptorSystem) -> DecoupledFault:
         added = changed.output_names[plant.ny :]
         return cached.setdefault(added, DecoupledFault(Removal(changed, other_faults), fault))
 
-    full = candidates.additions(fault, other_faults, lambda changed: free(changed).estimable)
-    constant = () if step else candidates.additions(fault, other_faults, lambda changed: free(changed).shows_at_rest)
+    full = candidates.additions(fault, other_faults, lambda changed: isolated(changed).estimable)
+    constant = (
+        () if step else candidates.additions(fault, other_faults, lambda changed: isolated(changed).shows_at_rest)
+    )
     texts = []
     if full:
         texts.append(f"{name}: Measure one of: {listed_sets(full)}.")
@@ -304,10 +311,10 @@ def _suggestion(candidates: _Candidates, name: str, for_detection: DecoupledFaul
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed_sets(more)} would make it detectable, but not estimable.")
-    if not candidates.searched:
+    if not candidates.search_scope:
         texts.append(f"{name}: obsynth.sensor_sets searches which sensors would help.")
     elif not texts and plant.nx:
-        texts.append(f"{name}: no further {candidates.searched} makes it estimable.")
+        texts.append(f"{name}: no further {candidates.search_scope} makes it estimable.")
     return texts
 
 
@@ -328,9 +335,9 @@ def _warnings(plant: DescriptorSystem, faults: Sequence[DecoupledFault]) -> tupl
             "sE - A is not regular: the equations leave states open or bind the inputs. The verdicts are about all "
             "trajectories that satisfy them."
         )
-    thin = [fault for fault in faults if not fault.clear]
-    if thin:
-        worst = min(thin, key=lambda fault: fault.gap)
+    unclear = [fault for fault in faults if not fault.clear]
+    if unclear:
+        worst = min(unclear, key=lambda fault: fault.gap)
         texts.append(
             f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.2g} only; orders, "
             "and in the worst case a verdict, may depend on the last digits of the data."

@@ -1,8 +1,9 @@
-"""Least order of a residual that shows a fault: the least degree in y and u of an equation without states.
+"""Least order of a residual that shows a fault: the least degree in y and u of a parity equation (free of states).
 
-Of ``z+ = A z + F f + K w``, ``0 = C z + G f + L w`` with w = [u; y], the equations of degree m in w are spanned by
-``s^k e``, k <= m, with e those of degree 0: the rows, and derivatives of equations that hold no w, which cost nothing.
-That is the least degree of a minimal polynomial basis (Forney 1975) among its rows that show the fault.
+The plant is ``z+ = A z + F f + K w``, ``0 = C z + G f + L w`` with w = [u; y].  Its equations of degree m in w are
+spanned by ``s^k e``, k <= m, where e runs over the equations of degree 0: the rows themselves, and the derivatives of
+equations that do not contain w.  The least order is the least degree among the rows of a minimal polynomial basis
+(Forney 1975) that show the fault.
 """
 
 from __future__ import annotations
@@ -60,13 +61,13 @@ def _echelon(rows: fmpq_mat) -> list[list[fmpq]]:
 
 
 def _independent_rows(rows: fmpq_mat, columns: int) -> fmpq_mat:
-    """Return independent combinations of rows whose first columns are independent; what has none of them goes."""
+    """Return a basis of the rows in echelon form, without the rows that are zero in the first columns."""
     listed = [row for row in _echelon(rows) if any(value != 0 for value in row[:columns])]
     return fmpq_mat(len(listed), rows.ncols(), [value for row in listed for value in row])
 
 
 def _from_column(rows: fmpq_mat, columns: int) -> fmpq_mat:
-    """Return independent combinations of rows that are zero in the first columns."""
+    """Return a basis of those combinations of rows that are zero in the first columns."""
     listed = list(dropwhile(lambda row: any(value != 0 for value in row[:columns]), _echelon(rows)))
     return fmpq_mat(len(listed), rows.ncols(), [value for row in listed for value in row])
 
@@ -113,15 +114,17 @@ def residual_orders(
 
 
 def _present_faults(hidden: FloatArray, terms: FloatArray) -> NDArray[np.bool_]:
-    """Return which faults stand in equations, of which these are the fault parts and the sizes of their terms."""
+    """Return which faults occur in equations, from their fault parts and the sizes of the terms that these sum up."""
     return np.asarray(np.any(np.linalg.norm(hidden, axis=1) > TRACE_TOLERANCE * np.maximum(terms, 1.0), axis=0))
 
 
 def _of_degree_zero(
     A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray
 ) -> tuple[_Rows, NDArray[np.bool_]]:
-    """Return the equations in which no derivative of w stands, and which faults have equations without z and w, as a
-    plant that is not regular may have them."""
+    """Return the equations without derivatives of w, and which faults occur in equations without z and w.
+
+    Only a plant that is not regular has equations of the second kind.
+    """
     n, count = A.shape[0], F.shape[1]
     alone = np.zeros(count, dtype=bool)
     rows, w = _Rows(C, G[:, None]), L
@@ -136,14 +139,17 @@ def _of_degree_zero(
         rows, w = rows.combined(left_vectors[:, :rank].T), left_vectors[:, :rank].T @ w
         if not len(new.z):
             break
-        # Their derivatives hold no derivative of w: they are of degree 0 as well.
+        # The derivatives of equations without w contain no derivative of w: they are of degree 0 as well.
         free, scale = free.joined(new), max(scale, largest_singular_value(A))
         rows, w = rows.joined(new.differentiated(A, F)), np.vstack([w, new.z @ K])
     return rows.joined(free), alone
 
 
 def _added_directions(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray, FloatArray]:
-    """Return what rows add to an orthonormal basis, orthonormal; fault parts of what adds nothing, and their terms."""
+    """Return the new orthonormal directions that rows add to a basis, and the fault parts of the other combinations.
+
+    The third value has the sizes of the terms that these fault parts are sums of, for judging their rounding.
+    """
     z, f = rows
     terms = np.linalg.norm(f, axis=(0, 1))
     for _ in range(2):

@@ -16,8 +16,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.diagnosis.candidate_sensors import Sensor, with_sensors
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
-from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import others
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray

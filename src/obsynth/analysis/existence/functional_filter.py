@@ -11,8 +11,8 @@ import numpy as np
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.diagnosing import model_points
 from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
-from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, dc_point
+from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil
