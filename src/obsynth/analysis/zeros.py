@@ -1,4 +1,4 @@
-"""Invariant zeros from the faults of a plant to its outputs, its unstable poles, and faults that never show."""
+"""Invariant zeros from the faults of a plant to its outputs, its unstable poles, and faults without effect."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import leading_names
 
-#: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
+#: A fault zero of a sampled plant with a modulus above this makes errors of a fault estimate decay slowly.
 SLOW_ZERO_RADIUS = 0.98
 
 
 def sampling_zero_warnings(plant: DescriptorSystem, inside: Sequence[complex] | None = None) -> tuple[str, ...]:
-    """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s;
-    ``inside``: the fault zeros inside, where they are known already."""
+    """Return a warning for each fault zero just inside the unit circle: errors decay in ``dt / -ln abs(z)`` seconds.
+
+    ``inside``: the fault zeros inside the unit circle, where the caller has them.
+    """
     if not plant.is_discrete:
         return ()
     if inside is None:
@@ -54,7 +56,10 @@ def fault_zeros(plant: DescriptorSystem) -> tuple[tuple[Zero, ...], tuple[Zero, 
 
 
 def hidden_faults(plant: DescriptorSystem, *, missing: int) -> tuple[str, ...]:
-    """Return the faults that never show, of a plant whose rank lacks so many at almost every point."""
+    """Return the faults of which some combination has no effect on the outputs.
+
+    ``missing``: the rank that the system matrix lacks at almost every point.
+    """
     pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
     kernels = []
     for point in GENERIC_POINTS:

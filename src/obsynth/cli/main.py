@@ -1,4 +1,4 @@
-"""The commands ``design`` and ``obsynth``: arguments in, exit code out; streams may be closed or full.
+"""Entry points of the commands ``design`` and ``obsynth``: command line, verb, exit code.
 
 Nothing heavy is imported here, so that ``--help`` answers at once.
 """
@@ -69,7 +69,7 @@ exit codes:
   6  a check of the shipped gains failed
 """
 
-#: Characters of a command on one line of a help of 78 columns, without its margin, a blank, dashes and a backslash.
+#: Longest line of an example command, so that its margin and the closing backslash fit into 78 columns of help.
 WIDEST_COMMAND = 70
 
 #: Verbs whose help lists the methods that are installed.
@@ -78,13 +78,13 @@ _VERBS_WITH_METHODS = ("design", "check", "compare")
 #: Exit code of a program whose reader has closed the pipe, by the convention of shells.
 BROKEN_PIPE = 141
 
-#: New objects after which Python looks for cycles of garbage, of a few MB: with its own number, a tenth of a short
-#: command was looking through what imports have made.
-NEW_OBJECTS = 100_000
+#: New objects, a few MB, after which Python looks for cyclic garbage.  With Python's default, a short command spent a
+#: tenth of its time in scans of the modules that it had imported.
+GARBAGE_THRESHOLD = 100_000
 
 
 def _all_verbs() -> dict[str, Verb]:
-    """Return the verbs of designs, and those of the packages above them that are installed, in the order of help."""
+    """Return the verbs of this package and of the installed packages above it, in the order of the help."""
     verbs, added = dict(DESIGN_VERBS), dict[str, tuple[Argument | Group | Settings, ...]]()
     if find_spec("obsynth.monitoring") is not None:
         from obsynth.monitoring.verbs.table import ADDED
@@ -150,13 +150,13 @@ def _with_verb(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentP
     if settings := settings_of(VERBS[name].arguments):
         add_settings(parser, settings)
     if name in _VERBS_WITH_METHODS:
-        # Asked for only when the help is printed: other packages may have registered some.
+        # The methods are looked up only when the help is printed: other packages may have registered some.
         parser.format_help = lambda: _help_with_methods(parser)  # type: ignore[method-assign]
     return parser
 
 
 def _in_lines(command: str) -> str:
-    """Return a command on as many lines as it needs, each broken before an option, as a shell reads them."""
+    """Return a shell command broken into lines before its options."""
     first, *others = command.split(" --")
     lines = [first]
     for part in others:
@@ -178,14 +178,17 @@ def _help_with_methods(parser: argparse.ArgumentParser) -> str:
 
 @contextmanager
 def usable_streams() -> Iterator[None]:
-    """Let texts go to nowhere where a stream is closed, print characters that an encoding lacks, warn in one line."""
+    """Make standard streams safe to print to, and print each warning on one line.
+
+    A closed stream is replaced by the null device; characters outside a stream's encoding are escaped.
+    """
     with warnings.catch_warnings(), ExitStack() as stack:
-        # Where in a library it arose is no use to the user.
+        # The line of a library that warns is no use to the user.
         warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
             if stream is None:
-                # The first file that is opened would get its number, and what is meant for the terminal.
+                # Otherwise the next file that is opened gets the stream's number, and with it the printed text.
                 setattr(sys, name, stack.enter_context(open(os.devnull, "w", encoding="utf-8", newline="")))
                 stack.callback(setattr, sys, name, None)
             elif hasattr(stream, "reconfigure"):
@@ -194,7 +197,7 @@ def usable_streams() -> Iterator[None]:
 
 
 def unwritable_output(error: OSError) -> int:
-    """Say that standard output takes no more, and return the exit code; nothing more is written to it."""
+    """Report that standard output cannot be written, and return the exit code; nothing more is written to it."""
     with suppress(OSError, ValueError, AttributeError):
         # The interpreter's own flush at exit must not complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -207,7 +210,7 @@ def unwritable_output(error: OSError) -> int:
 
 
 def reported_error(error: Exception) -> ObsynthError | None:
-    """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
+    """Return an error of Python or of a library as one for the user; `None` if it is a defect of obsynth."""
     if isinstance(error, MemoryError):
         return SolverError("The computation does not fit into the memory: the result is inconclusive.")
     if isinstance(error, RecursionError):
@@ -227,7 +230,7 @@ def reported_error(error: Exception) -> ObsynthError | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``obsynth``."""
     words = sys.argv[1:] if arguments is None else arguments
-    # A script of completion knows the arguments of all commands; otherwise only those of one are made.
+    # A completion script needs the arguments of all commands, a run only those of one.
     return _run(obsynth_parser(None if "--print-completion" in words else words), words)
 
 
@@ -237,7 +240,7 @@ def design_command(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
-    with usable_streams(), protected_inputs(), _collected_rarely():
+    with usable_streams(), protected_inputs(), _rare_garbage_collection():
         try:
             try:
                 return _outcome(_options(parser, arguments))
@@ -247,15 +250,15 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
             print("Interrupted.", file=sys.stderr)
             return 130
         except OSError as error:
-            # Files are read and written elsewhere, with errors of their own: this is standard output.
+            # Reading and writing of files raises SpecError, so this error comes from standard output.
             return unwritable_output(error)
 
 
 @contextmanager
-def _collected_rarely() -> Iterator[None]:
-    """Look for cycles of garbage less often than Python does by itself."""
+def _rare_garbage_collection() -> Iterator[None]:
+    """Make Python look for cyclic garbage less often than by default."""
     before = gc.get_threshold()
-    gc.set_threshold(NEW_OBJECTS, *before[1:])
+    gc.set_threshold(GARBAGE_THRESHOLD, *before[1:])
     try:
         yield
     finally:
@@ -263,7 +266,7 @@ def _collected_rarely() -> Iterator[None]:
 
 
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the arguments of a command line, settings among them."""
+    """Return the parsed arguments of a command line, its settings (``--set NAME=VALUE``) among them."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     options, unknown = parser.parse_known_args(words)
     options.command = shlex.join([parser.prog, *words])
@@ -274,7 +277,7 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
 
 
 def _refuse_words(prog: str, verb: str, unknown: Sequence[str]) -> NoReturn:
-    """End the program as words that a verb does not take do: with its usage, and what may be meant."""
+    """End the program with the usage of the verb and, for a misspelt option, the one that may be meant."""
     own = _with_verb(verb, Parser(prog=prog if prog == verb else f"{prog} {verb}"))
     known = [
         *own._option_string_actions,
@@ -287,7 +290,7 @@ def _refuse_words(prog: str, verb: str, unknown: Sequence[str]) -> NoReturn:
 
 
 def _outcome(options: argparse.Namespace) -> int:
-    """Run the verb; return its exit code, or that of its error after telling it."""
+    """Run the verb and return its exit code; print an error and return the error's exit code."""
     try:
         named = ("output", "out", "write_spec", "to", "state", "prove")
         is_written = options.verb == "design" or any(getattr(options, name, None) not in (None, "-") for name in named)
@@ -300,7 +303,7 @@ def _outcome(options: argparse.Namespace) -> int:
     except ObsynthError as error:
         failure = error
     except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:
-        # LAPACK's errors are among the last.
+        # numpy's LinAlgError is a ValueError.
         reported = reported_error(error)
         if reported is None:
             raise

@@ -1,16 +1,17 @@
-r"""Observers of polytopic plants whose parameter has a bounded rate: inequalities with a Lyapunov matrix P(t) of it.
+r"""Observers of polytopic plants whose parameter has a bounded rate: inequalities in a parameter-dependent P(t).
 
-In continuous time, with two vertices: t in [0, 1] is the weight of the second one and changes by at most nu a second.
-P(t), and Y(t) of the gain ``L(t) = P(t)^-1 Y(t)``, are polynomials in t in Bernstein form.  For all t, and both signs,
+Time is continuous and there are two vertices: t in [0, 1] is the weight of the second vertex, and changes by at most
+nu per second.  P(t), and Y(t) of the gain ``L(t) = P(t)^-1 Y(t)``, are polynomials in t in Bernstein form.  If for all
+t and both signs
 
 .. math::
     \begin{bmatrix} \mathrm{He}(P A - Y C) \pm \nu P' & P B - Y D & C_z^T \\ * & -\gamma^2 I & D_z^T \\ * & * & -I
     \end{bmatrix} < 0, \qquad P > 0 \tag{V6}
 
-gives errors whose L2 gain from w to z is at most gamma.  For a decay ``exp(-a time)`` the first block has ``2 a P``
-besides, and the rows of w and z are left out.  The polynomial in t is negative definite on [0, 1] where all its
-Bernstein coefficients on equal pieces of [0, 1] are (`obsynth.numerics.bernstein`).  Where gains are given, L linear in
-t, ``P (A - L C)`` takes the place of ``P A - Y C``.
+then the L2 gain of the error system from w to z is at most gamma.  For a decay ``exp(-a time)`` the term ``2 a P`` is
+added to the first block, and the rows of w and z are left out.  The polynomial in t is negative definite on [0, 1] if
+all its Bernstein coefficients on equal pieces of [0, 1] are (`obsynth.numerics.bernstein`).  For given gains, with L
+linear in t, ``P (A - L C)`` takes the place of ``P A - Y C``.
 
 Reference: Wu, Yang, Packard, Becker, Int. J. Robust Nonlinear Control 6 (1996).
 """
@@ -49,36 +50,36 @@ def rated_inequalities(
     gain_limit: float | None = None,
     margin: float = MARGIN,
 ) -> Conditions:
-    """Return the inequalities of an error system whose weight moves slowly, in P and Y.
+    """Return the inequalities in P and Y for an error system whose parameter has a bounded rate.
 
     Parameters
     ----------
     errors : ErrorPolytope
-        Two vertices, in continuous time, without algebraic errors; C and D constant unless gains are given.
+        Two vertices, in continuous time, without algebraic errors; C and D are constant unless gains are given.
     rate : float
         Largest rate of the weight of the second vertex, in 1/s: the weight moves between 0 and 1.
     goal : {"gain", "decay"}, optional
-        The least L2 gain from w to z, or the largest slack of ``decay``.
+        Minimise the L2 gain from w to z, or maximise the slack of the inequality of ``decay``.
     level : float, optional
-        A given gain: the largest slack at that level is sought instead, which is what makes a proof pass.
+        A fixed L2 gain: the slack at this level is maximised instead, so that a proof has room for rounding.
     decay : float, optional
-        Errors decay at least like ``exp(-decay time)``, in 1/s; part of either goal's inequality.
+        Errors decay at least like ``exp(-decay time)``, in 1/s; both goals include it.
     degree : int, optional
-        Of P and Y, 0 to 5.
+        Degree of P and Y in t, 0 to 5.
     pieces : int, optional
-        Of [0, 1], a power of two: more of them allow more, at more cost.
+        Number of equal pieces of [0, 1], a power of two: more pieces are less conservative and cost more.
     gains : sequence of array_like, optional
-        One gain, or one at each end, linear between: they are analysed.
+        Gains to be analysed: one constant gain, or one for each end with linear interpolation between.
     gain_limit : float, optional
         Largest Frobenius norm of each coefficient of Y.
     margin : float, optional
-        What the inequalities keep to the boundary of the cone.
+        Least slack of every inequality, where the slack is not maximised.
 
     Returns
     -------
     Conditions
-        Variables ``P[1]``, ..., ``Y[1]``, ... (Bernstein coefficients), ``gamma_squared`` or ``room``; gains ``P[1]``,
-        ..., and ``L[1]``, ``L[2]``: those at the ends.
+        Variables ``P[1]``, ..., ``Y[1]``, ... (Bernstein coefficients), and ``gamma_squared`` or ``room`` (the slack);
+        gains ``P[1]``, ..., and ``L[1]``, ``L[2]`` at the two ends.
 
     Raises
     ------
@@ -87,7 +88,8 @@ def rated_inequalities(
 
     Examples
     --------
-    The commutator of a gain with the unit lag: L2 gain 1 for any motion of the gain, about the rate for slow ones.
+    The commutator of a time-varying gain with the lag ``1 / (s + 1)`` has an L2 gain of 1 for arbitrarily fast gains,
+    and of about the rate for slow ones.
 
     >>> import numpy as np
     >>> errors = ErrorPolytope(
@@ -157,7 +159,7 @@ def _coefficients_v6(
     goal: str,
     pieces: int,
 ) -> Iterator[tuple[str, list[list[Any]]]]:
-    """Yield the Bernstein coefficients of minus the matrix of (V6), by name, as lower blocks."""
+    """Yield the name and the lower blocks of each Bernstein coefficient of the negated matrix of (V6)."""
     P, Y = unknowns
     closed = None if gains is None else [errors.at(vertex, gains) for vertex in np.eye(2)]
     A, B = (errors.A, errors.B) if closed is None else ([c[0] for c in closed], [c[1] for c in closed])

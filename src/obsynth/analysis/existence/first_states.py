@@ -1,4 +1,4 @@
-"""What is stated of the first state of a plant, for one that has more states than are written."""
+"""Mean and covariance of the initial state of a plant that is augmented with further states."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 
 
-def extended_mean(state: Any, written: int, more: int) -> FloatArray:
-    """Return the mean of the first state with ``more`` states of mean zero behind the ``written`` ones."""
-    mean = np.zeros(written) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
-    require_shape(mean.shape, (written,), "initial_state")
-    return np.concatenate([mean, np.zeros(more)])
+def extended_mean(state: Any, nx: int, added: int) -> FloatArray:
+    """Return the initial mean of ``nx`` states (zero where none is stated), followed by zeros for the added states."""
+    mean = np.zeros(nx) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
+    require_shape(mean.shape, (nx,), "initial_state")
+    return np.concatenate([mean, np.zeros(added)])
 
 
-def stated_covariance(covariance: Any, written: int) -> FloatArray:
-    """Return the covariance of the first state ``(written, written)``: the identity where none is stated, and that
-    multiple of it where a number is."""
-    own = np.eye(written) if covariance is None else as_matrix(covariance, "initial_covariance")
-    own = own[0, 0] * np.eye(written) if own.shape == (1, 1) else own
-    require_shape(own.shape, (written, written), "initial_covariance")
-    return own
+def stated_covariance(covariance: Any, nx: int) -> FloatArray:
+    """Return the initial covariance ``(nx, nx)``: a number means that multiple of the identity, ``None`` means 1."""
+    matrix = np.eye(nx) if covariance is None else as_matrix(covariance, "initial_covariance")
+    matrix = matrix[0, 0] * np.eye(nx) if matrix.shape == (1, 1) else matrix
+    require_shape(matrix.shape, (nx, nx), "initial_covariance")
+    return matrix
 
 
-def extended_covariance(own: FloatArray, more: FloatArray) -> FloatArray:
-    """Return the covariance of the first state with states of the variances ``more`` behind it."""
-    return np.asarray(block_diag(own, np.diag(more)))
+def extended_covariance(covariance: FloatArray, added_variances: FloatArray) -> FloatArray:
+    """Return the initial covariance with independent states of the given variances added."""
+    return np.asarray(block_diag(covariance, np.diag(added_variances)))

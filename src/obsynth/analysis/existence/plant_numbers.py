@@ -1,4 +1,4 @@
-"""The numbers of a plant on which existence is decided: rational as written, or enclosed where it was sampled."""
+"""Exact or enclosed numbers of a plant, on which existence is decided: rational, or balls for a sampled plant."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ from obsynth.proofs.exact_arithmetic import (
 )
 from obsynth.proofs.exact_pencils import ExactPencil, system_pencil
 
-#: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
-#: to floating point.
+#: Degree of the minimal polynomial of an eigenvalue times columns of the pencil.  Above it the rank at the eigenvalue
+#: is decided in floating point.
 MOST_EXACT_SIZE = 400
 
-#: Plants of more states are decided in floating point.
+#: Plants with more states are decided in floating point.
 EXACT_STATES = 64
 
+#: The same limit for plants that were sampled, whose matrix exponential is enclosed.
 SAMPLED_STATES = 24
 
-#: Of computed data an exact answer says little more than floating point does, and takes longer.
+#: The same limit for computed data, where an exact answer says little more than floating point and takes longer.
 COMPUTED_STATES = 24
 
 
 @dataclass(frozen=True, eq=False)
 class SystemFacts:
-    """What is known of ``[A - s E, B; C, D]``: from rational arithmetic (``exact``), to hundreds of digits, or not."""
+    """Normal rank and zeros of ``[A - s E, B; C, D]``: rational where ``exact``, else from enclosures or floats."""
 
     normal_rank: int
     columns: int
@@ -49,26 +50,26 @@ class SystemFacts:
     zeros: tuple[complex, ...]
     exact: bool
     computed: bool = False  # whether some of the data were computed in floating point
-    decisions: tuple[RankDecision, ...] = ()  # on the way, in floating point
+    decisions: tuple[RankDecision, ...] = ()  # those in floating point that the facts rest on
 
     def timed(self, rate: float) -> SystemFacts:
-        """Return the same with eigenvalues multiplied by a rate, for a plant in another unit of time."""
+        """Return the facts in another unit of time: zeros are multiplied by ``rate``."""
         zeros, outside = (tuple(value * rate for value in values) for values in (self.zeros, self.outside))
         return replace(self, zeros=zeros, outside=outside)
 
     @property
     def full(self) -> bool:
-        """Whether the normal rank is that of all columns."""
+        """Whether the normal column rank is full."""
         return self.normal_rank == self.columns
 
 
 @dataclass(frozen=True, eq=False)
 class PlantNumbers:
-    """Matrices of a plant, ranks and zeros of what is made of them.
+    """Matrices of a plant as rational numbers or balls, with ranks and zeros of pencils made of them.
 
-    Rational ones as written; of a plant that was sampled enclosures of so many ``bits``, where what sampling leaves
-    (``E, C, Df, Dd``) is rational too.  ``computed`` where some were computed in floating point and are known to their
-    last digit.
+    A plant with stated numbers has rational ``matrices``.  A plant that was sampled has enclosures with ``bits`` bits;
+    the matrices that sampling does not change (``E, C, Df, Dd``) are also in ``rational``.  ``computed`` is set where
+    some numbers are results of floating point, known only to their last digit.
     """
 
     matrices: Mapping[str, Any]
@@ -80,38 +81,38 @@ class PlantNumbers:
 
     @property
     def exact(self) -> bool:
-        """Whether all of them are rational."""
+        """Whether all matrices are rational."""
         return self.bits is None
 
     def _with_many_bits(self) -> Any:
-        """Compute with as many bits as the enclosures have."""
+        """Return a context in which flint computes with as many bits as the enclosures have."""
         return flint.ctx.workprec(self.bits or flint.ctx.prec)
 
     def zeros(self, rows: int, columns: int) -> Any:
-        """Return a zero matrix."""
+        """Return a zero matrix of this kind of number."""
         return zeros_matrix(rows, columns) if self.exact else arb_mat(rows, columns)
 
     def as_own(self, matrix: fmpq_mat) -> Any:
-        """Return a rational matrix as one of these numbers."""
+        """Return a rational matrix in this kind of number."""
         with self._with_many_bits():
             return matrix if self.exact else arb_mat(matrix)
 
     def product(self, first: Any, second: Any) -> Any:
-        """Return a product."""
+        """Return the product of two matrices."""
         with self._with_many_bits():
             return first * second
 
     def rank(self, matrix: Any) -> int:
-        """Return the rank of a matrix; of enclosures to digits."""
+        """Return the rank of a matrix; for enclosures, to their working digits."""
         with self._with_many_bits():
             return rank_of(matrix) if self.exact else rank_to_digits(matrix.tolist())
 
     def columns(self, name: str, columns: Sequence[int] | None) -> Any:
-        """Return a matrix by its name, or some of its columns."""
+        """Return the matrix of this name, or some of its columns."""
         return self.matrices[name] if columns is None else picked_columns(self.matrices[name], columns)
 
     def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
-        """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""
+        """Return the numbers with some matrices replaced; ``rational``: their rational forms, for a sampled plant."""
         own = {**self.rational, **(changes if self.exact else rational)}
         return replace(self, matrices={**self.matrices, **changes}, rational=own, cache={})
 
@@ -129,20 +130,22 @@ class PlantNumbers:
         if self.bits is None:
             return system_pencil(e, a, inputs, c, direct)
         matrix = blocks([[a, inputs], [c, direct]])
-        states, outputs, extra = int(a.nrows()), int(c.nrows()), int(inputs.ncols())
-        nothing = zeros_matrix(states, extra), zeros_matrix(outputs, states), zeros_matrix(outputs, extra)
-        return EnclosedPencil(blocks([[e, nothing[0]], [nothing[1], nothing[2]]]), matrix.tolist(), self.bits)
+        nx, ny, width = int(a.nrows()), int(c.nrows()), int(inputs.ncols())
+        padded_e = blocks([[e, zeros_matrix(nx, width)], [zeros_matrix(ny, nx), zeros_matrix(ny, width)]])
+        return EnclosedPencil(padded_e, matrix.tolist(), self.bits)
 
     def rank_at_root(self, inputs: Any, direct: Any, polynomial: fmpz_poly) -> int | None:
         """Return the rank of ``[A - s E, inputs; C, direct]`` at the roots of an irreducible polynomial.
-        ``None``: left to floating point."""
+
+        ``None`` where the decision would be too expensive, and floating point has to make it.
+        """
         pencil, degree = self.pencil(inputs, direct), int(polynomial.degree())
         if isinstance(pencil, ExactPencil):
             return None if pencil.shape[1] * degree > MOST_EXACT_SIZE else pencil.rank_at_root(polynomial)
         return None if degree > 1 else pencil.rank_at(flint.arb(flint.fmpq(-polynomial[0], polynomial[1])))
 
     def system(self, inputs: Any, direct: Any) -> SystemFacts:
-        """Return facts on ``[A - s E, inputs; C, direct]``; zeros only where the normal rank is full."""
+        """Return rank and zeros of ``[A - s E, inputs; C, direct]``; zeros only where the normal rank is full."""
         key = ("system", str(inputs.tolist()), str(direct.tolist()))
         facts: SystemFacts = self.remembered(key, lambda: self._decided(self.pencil(inputs, direct)))
         return facts
@@ -160,14 +163,14 @@ class PlantNumbers:
         return SystemFacts(rank, columns, () if stable else outside, values, False, self.computed)
 
     def remembered(self, key: object, decide: Callable[[], Any]) -> Any:
-        """Return what has been decided before under this key, or decide it."""
+        """Return the cached value of a key; ``decide`` computes it at the first call."""
         if key not in self.cache:
             self.cache[key] = decide()
         return self.cache[key]
 
 
 def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any, *, computed: bool = False) -> PlantNumbers:
-    """Return enclosures of a continuous plant with ``E = I``, sampled every so many seconds (a Fraction)."""
+    """Return enclosures of a continuous plant with ``E = I`` after zero-order hold with a rational ``sample_time``."""
     states, faults, unknown = (int(exact[name].ncols()) for name in ("A", "Bf", "Bd"))
     width = faults + unknown
     step = flint.fmpq(sample_time.numerator, sample_time.denominator)
@@ -190,7 +193,7 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
 
 @dataclass(frozen=True, eq=False)
 class _Content:
-    """A plant that equals another one with the same numbers: plants are made again, and decided once."""
+    """A cache key: two plants with the same numbers are equal, so that equal plants are decided once."""
 
     plant: DescriptorSystem
     key: tuple[object, ...]
@@ -209,7 +212,7 @@ class _Content:
         return isinstance(other, _Content) and self.key == other.key
 
 
-# Conditions, synthesis and verification ask for the same plant's several times; plants never change.
+# Conditions, synthesis and verification ask for the numbers of the same plant several times; plants never change.
 @lru_cache(maxsize=8)
 def _numbers_of(content: _Content) -> PlantNumbers | None:
     plant = content.plant

@@ -1,4 +1,4 @@
-"""Whether a fault model can be distinguished from states and unknown inputs: (D3), and the order of the model."""
+"""Existence conditions on a fault model: (D3), and whether double precision can represent its order."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ from obsynth.plants.signal_names import MOST_NAMES, leading_names
 
 
 def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    """Return the conditions (D3), one for each unstable eigenvalue of the fault model in the closed upper half plane.
+
+    A failing condition ends the list.
+    """
     plant, units, scaled_model = judge.natural, judge.units, judge.units.scaled_model(model)
     sizes = None if judge.terms is None else units.scaled_plant(judge.terms)
     eigenvalues = map(complex, scaled_model.eigenvalues)
@@ -42,7 +45,7 @@ def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
         lost = exact_loss(judge, model, units.eigenvalue(value))
         decision = _model_rank(plant, scaled_model, value, lost, sizes)
         if lost is None and not decision.full:
-            # Of a plant of many parts its own units drift apart; rounding is as small in those that were given.
+            # Natural units of a plant of many parts drift apart; the given units may then have less rounding.
             as_given = _model_rank(judge.plant, model, units.eigenvalue(value), None)
             decision = max(decision, as_given, key=lambda each: each.rank)
         condition = _model_condition(scaled_model, decision, plant, value, units)
@@ -58,7 +61,7 @@ def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
 
 
 def _model_matrix(plant: DescriptorSystem, amplitudes: NDArray[Any], value: complex) -> NDArray[Any]:
-    """Return the matrix of (D3) at an eigenvalue; ``amplitudes (nf, any)``: of the faults along its eigenvectors."""
+    """Return the matrix of (D3) at an eigenvalue; ``amplitudes (nf, k)``: the faults along its k eigenvectors."""
     inputs, direct = independent_disturbances(plant)
     return np.block(
         [
@@ -75,11 +78,11 @@ def _fault_amplitudes(model: Exosystem, value: complex) -> NDArray[Any]:
 def _model_rank(
     plant: DescriptorSystem, model: Exosystem, value: complex, lost: int | None, sizes: DescriptorSystem | None = None
 ) -> RankDecision:
-    """Decide (D3); ``sizes`` of the terms that the entries of the plant are sums of."""
+    """Decide (D3); ``sizes``: magnitudes of the terms that the entries of the plant are sums of."""
     amplitudes, share = _fault_amplitudes(model, value), np.inf
     matrix = _model_matrix(plant, amplitudes, value)
     if sizes is not None:
-        # Disturbances that are combinations of others are judged as those: their own terms are not known.
+        # Disturbances that were replaced by independent combinations have no known terms: use their own magnitude.
         inputs, direct = independent_disturbances(plant)
         own = inputs.shape == plant.Bd.shape
         terms = np.block(
@@ -139,14 +142,17 @@ def _model_condition(
 
 
 def _named(judge: Evaluator, model: Exosystem, *, of_the_model: bool) -> NamedPencil:
-    """Return plant and fault model as a pencil of which each entry is known by its name."""
+    """Return the pencil of plant and fault model, with a name for each entry."""
     return named_augmented(
         judge.plant, model, judge.units, independent=judge.independent_disturbances, of_the_model=of_the_model
     )
 
 
 def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
-    """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
+    """Return the condition that the fault model is observable in double precision.
+
+    At a zero z0 a model of order n shows in the outputs with only about ``abs(z0)^(n + 1)``.
+    """
     plant, units = judge.natural, judge.units
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
@@ -182,7 +188,7 @@ def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
 
 
 def rank_at(augmented: AugmentedPlant, disturbances: tuple[FloatArray, FloatArray], point: complex) -> RankDecision:
-    """Decide whether plant and fault model have a mode at a point that these disturbances can hide."""
+    """Decide the rank of the pencil of plant and fault model at a point where these disturbances may hide a mode."""
     inputs, direct = disturbances
     below = augmented.below(inputs)
     matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), direct]])
@@ -201,7 +207,7 @@ def _order_doubt(judge: Evaluator, model: Exosystem, point: complex) -> Unclear:
 
 
 def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condition:
-    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
+    """Return the failing condition for an unstable mode that seems unobservable though all other conditions hold."""
     order = judge.plant.nx + model.order
     condition = Condition(
         "fault model in double precision",
@@ -211,8 +217,7 @@ def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condi
         float(order),
         "ours: exact observability is not enough in double precision",
         f"plant and fault model (order {model.order}) seem to have an unobservable unstable mode at {number(mode)}, "
-        "which the "
-        "conditions above exclude: in double precision the order of the model is too high. Lower it.",
+        "which the conditions above exclude: in double precision the order of the model is too high. Lower it.",
         mode=mode,
         signals=judge.plant.fault_names,
     )
