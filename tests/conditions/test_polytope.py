@@ -11,7 +11,7 @@ import pytest
 from obsynth.conditions import ErrorPolytope, vertex_inequalities
 from obsynth.conditions.polytope import witness_of
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.engines.fastest_decay import fastest_of
+from obsynth.methods.engines.fastest_decay import fastest_allowed_decay
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.proofs.vertex_inequalities import Witness, pairs_of, prove_decay, prove_gain, prove_mean_square
 from obsynth.verification.over_region import worst_switching
@@ -270,7 +270,7 @@ def test_the_fastest_decay_of_a_matrix_is_where_its_proof_ends(dt: float) -> Non
     errors = ErrorPolytope([[[0.3, 0.2], [-0.1, 0.4]], [[0.1, 0.5], [0.0, 0.2]]], np.zeros((0, 2)), dt=dt)
     errors = errors if dt else ErrorPolytope([a - np.eye(2) for a in errors.A], np.zeros((0, 2)), dt=dt)
     witness = Witness([np.array([[1.0, 0.1], [0.1, 2.0]])])
-    rate = fastest_of(errors, _NO_GAIN, witness)
+    rate = fastest_allowed_decay(errors, _NO_GAIN, witness)
     assert rate is not None
     closed, room = errors.closed(_NO_GAIN), 1e-9 * (1.0 if dt else -1.0)
     assert prove_decay(closed, witness, rate + room, discrete=dt > 0.0).proved

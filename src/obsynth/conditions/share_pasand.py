@@ -42,10 +42,11 @@ from obsynth.conditions.share_pasand_over_region import share_pasand_over_region
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.eigenstructure import place
 from obsynth.numerics.gain_levels import is_positive
 from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
+from obsynth.numerics.requested_poles import checked_poles
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem

@@ -1,4 +1,4 @@
-"""Verification: every claim recomputed from the plant and the shipped realisation, without synthesis or solvers."""
+"""Verification of a design: every claim is recomputed from the plant and the stored observer, without any solver."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ from obsynth.verification.requested_limits import requested_rows
 from obsynth.verification.settled_faults import ConstantFaults
 from obsynth.verification.stored_numbers import stored_number_rows
 
-#: The package whose methods prove decay by rows of their own, which its tests break one by one.
-PLATFORM = "obsynth"
+#: Methods of this package prove decay by checks of their own, each of which a test breaks.  Methods of other packages
+#: get the checks that no method can leave out.
+OWN_PACKAGE = "obsynth"
 
 
 @arguments_checked
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:
-    """Recompute every claim of a design from its plant and its shipped realisation.
+    """Recompute every claim of a design from its plant and its stored observer.
 
     Parameters
     ----------
     design : ObserverDesign
         Made by a method, loaded from a file, or put together by hand.
     printed_digits : int, optional
-        Decimals to which the gains T, N, L and W were printed, for gains from a paper: equalities are then judged
-        against what half a unit in the last decimal of every entry can do, to first order.  By default they are judged
-        against double precision.
+        Decimals to which the gains T, N, L and W were printed, for gains from a paper.  Equalities then have a
+        tolerance of what half a unit in the last decimal of every entry changes, to first order.  By default the
+        tolerance is that of double precision.
 
     Returns
     -------
     VerificationReport
-        Inequalities are proved with rounding bounds; equalities are residuals against a bound scaled by the data.
+        Inequalities are proved with bounds on rounding errors; equalities have a residual and a bound that scales
+        with the data.
 
     Raises
     ------
@@ -74,12 +76,12 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
         shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
         rows = (*mean_rows, *_own_rows(method, design, printed_digits))
-        own = method.__module__.partition(".")[0] == PLATFORM
+        own = method.__module__.partition(".")[0] == OWN_PACKAGE
         linear = isinstance(design.observer, LinearObserver)
         if linear and not own:
-            rows = (*rows, *_conditions_again(method, design, rows))
+            rows = (*rows, *_existence_rows(method, design, rows))
             rows = (*rows, *platform_rows(*design.linear, open_loop=method.open_loop))
-        # A method of ours may rely on bounds of states instead; another has to say what its observer follows.
+        # A method of this package may prove bounds of states instead; any other has to state an error model.
         tracked = linear and (not own or method.has_error_model(design))
         if tracked and all(row.passed for row in rows):
             model = method.error_model(design)
@@ -99,7 +101,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
 
 
 def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield the row on the estimates of constant faults, of what is shipped: with its mean, if it has one."""
+    """Yield the check of the estimates of constant faults, of the shipped observer with its averaging, if any."""
     model = method.error_model(shipped)
     if model is None or not model.fits or not model.observer.fault_names:
         return
@@ -122,8 +124,8 @@ def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_
         )
 
 
-def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:
-    """Yield the method's conditions of existence, asked of the plant again, but for those that it has rows of."""
+def _existence_rows(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:
+    """Yield the method's conditions of existence, decided again on the plant, without those that are in ``known``."""
     try:
         options = {name: design.options[name] for name in field_types(method) if name in design.options}
         conditions = method.of(options).existence(design.plant)
@@ -137,11 +139,11 @@ def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple
 
 
 def _option_rows(method: type[Method], design: ObserverDesign) -> Iterator[Check]:
-    """Yield the rows on the options, with which a design is printed: they can be read, and what they ask for holds.
+    """Yield the checks of the stored options: they are valid for the method, and the design keeps the limits they set.
 
-    Recursive and nonlinear observers hold options in forms of their own, which the checks of these methods read.
+    Recursive and nonlinear observers store options in forms of their own, which the checks of their methods read.
     """
-    # Of functions their names alone are stored.
+    # A design stores only the names of these functions.
     fields = field_types(method).keys() - {"constraints", "objective"}
     stored = {name: value for name, value in design.options.items() if name in fields}
     try:
@@ -155,7 +157,7 @@ def _option_rows(method: type[Method], design: ObserverDesign) -> Iterator[Check
 
 
 def _own_rows(method: type[Method], design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield the rows of the method's own checks; those of a file that was changed may not even be computable."""
+    """Yield the method's own checks; a failing one where a changed file makes them impossible to compute."""
     try:
         yield from method.checks(design, printed_digits)
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""The plant that a method works on: arrays, without the algebraic states of large plants, of index 1 at most."""
+"""The plant that a method designs for: the given plant, or a form of it with fewer algebraic states or lower index."""
 
 from __future__ import annotations
 
@@ -27,25 +27,39 @@ if TYPE_CHECKING:
 #: Options whose values belong to the states and equations as written.
 _OF_STATES_AS_WRITTEN = ("Q", "initial_state", "initial_covariance", "state_bounds")
 
-#: Conditions that every state is dynamic or measured, which no observer needs.
+#: Conditions of methods that every state is dynamic or measured.  Elimination of algebraic states removes the need.
 _DYNAMIC_OR_MEASURED = ("rank [E; C]", "rank [N E; C]", "rank [E 0; 0 0; C Df]")
 
 
 @dataclass(frozen=True, eq=False)
 class WorkingPlant:
-    """A plant with the way back to the one as written, and what a user should know; ``reduced``: what was done to a
-    plant of index 2 or more, or with algebraic states that a method does not take."""
+    """A plant that a method designs for, with the recovery of the given plant's states.
+
+    Parameters
+    ----------
+    plant : Plant
+        The given plant or a transformed one.
+    recovery : StateRecovery or None
+        The given plant's states as functions of this plant's; ``None`` where they are the same.
+    notes : tuple of str
+        Notes on the transformation, for the user.
+    reduced : str
+        What was done to a plant of index 2 or more, or with algebraic states that the method does not take; else "".
+    dropped : tuple of str
+        States of the given plant that cannot be recovered.
+    method : Method or None
+        The method with its options restated for this plant; ``None`` where they are unchanged.
+    """
 
     plant: Plant
     recovery: StateRecovery | None
     notes: tuple[str, ...] = ()
     reduced: str = ""
     dropped: tuple[str, ...] = ()
-    method: Method | None = None  # with its options for this plant; ``None`` where they are the same
+    method: Method | None = None
 
     def sensors(self) -> tuple[Sensor, ...] | None:
-        """Return a sensor for each state as written that a reduced plant still has; ``None`` where it was not
-        reduced."""
+        """Return a sensor for each recoverable state of the given plant; ``None`` where it was not reduced."""
         from obsynth.analysis.diagnosis.candidate_sensors import recovered_sensors
 
         if not self.reduced or self.recovery is None or not isinstance(self.plant, DescriptorSystem):
@@ -53,7 +67,7 @@ class WorkingPlant:
         return recovered_sensors(self.plant, self.recovery, self.dropped)
 
     def conditions(self) -> tuple[Condition, ...]:
-        """Return the condition that says how the index was reduced; none where it was not."""
+        """Return one condition, which states how the plant was reduced; none where it was not."""
         if not self.reduced:
             return ()
         source = "Dai 1989, section 1.2"
@@ -63,7 +77,7 @@ class WorkingPlant:
 def working_plant(
     plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None], method: Method | None
 ) -> WorkingPlant:
-    """Return the plant that a method works on; ``method`` decides, with its options, whether the index is reduced."""
+    """Return the plant that a method designs for; the method and its options decide whether the index is reduced."""
     if not isinstance(plant, DescriptorSystem):
         return WorkingPlant(plant, recovery)
     if plant.nx < MANY_VARIABLES:
@@ -83,16 +97,18 @@ def working_plant(
 def with_derivatives_as_inputs(
     plant: Plant, recovery: StateRecovery | None, method: Method, working: WorkingPlant
 ) -> WorkingPlant | None:
-    """Return the proper form of a plant that was taken as written, with derivatives of known inputs as inputs of their
-    own; ``None`` where none is needed, or the method does not exist for it."""
+    """Return the proper form of a plant in which derivatives of known inputs are further inputs.
+
+    ``None`` where the plant was reduced already or needs no derivatives, or the method does not exist for that form.
+    """
     if not isinstance(plant, DescriptorSystem) or working.reduced or plant.nx > EXACT_ELIMINATION_UP_TO:
         return None
     if (structure_of(plant).index or 0) < 2 or method.is_for_states_as_written(plant):
         return None
-    found = _with_input_derivatives(plant.dense())
-    if found is None or not _exists(found[0].plant, method):
+    proper = _with_input_derivatives(plant.dense())
+    if proper is None or not _exists(proper[0].plant, method):
         return None
-    return _in_proper_form(plant, recovery, method, *found)
+    return _in_proper_form(plant, recovery, method, *proper)
 
 
 def _in_proper_form(
@@ -121,8 +137,11 @@ def _composed_recovery(recovery: StateRecovery | None, transformation: Transform
 
 
 def _of_low_index(plant: DescriptorSystem, method: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
-    """Return the minimal proper form of a plant of index 2 or more, or of one of index 1 that the method takes in that
-    form alone, and what was left out for it; ``None`` for any other plant, or where the method takes it as written."""
+    """Return the transformation to a minimal proper form, with notes on outputs that were left out or changed.
+
+    The plant has index 2 or more, or index 1 and the method does not take its algebraic states.  ``None`` for all
+    other plants, and where the method takes the plant as written.
+    """
     index = structure_of(plant).index or 0
     if plant.nx > EXACT_ELIMINATION_UP_TO or index == 0:
         return None, ()
@@ -145,7 +164,7 @@ def _reason(plant: DescriptorSystem) -> str:
 
 
 def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) -> Transformation | None:
-    """Return a plant of index 1 without its algebraic states where a method takes it in that form alone."""
+    """Return a plant of index 1 without its algebraic states if the method exists for that form only, else ``None``."""
     if method is None or any(getattr(method, name, None) is not None for name in _OF_STATES_AS_WRITTEN):
         return None
     if _is_dynamic_or_measured(plant):
@@ -164,19 +183,18 @@ def _without_algebraic_states(plant: DescriptorSystem, method: Method | None) ->
 
 
 def _is_dynamic_or_measured(plant: DescriptorSystem) -> bool:
-    """Whether every state is, sensor faults as states too: then no method refuses the plant for one that is not."""
+    """Whether ``[E 0; C Df]`` has full column rank: every state, and every sensor fault, is dynamic or measured."""
     sensor_faults = plant.Df[:, np.any(plant.Df != 0.0, axis=0)]
-    nothing = np.zeros((plant.nx, sensor_faults.shape[1]))
-    stacked = np.block([[plant.E, nothing], [plant.C, sensor_faults]])
+    stacked = np.block([[plant.E, np.zeros((plant.nx, sensor_faults.shape[1]))], [plant.C, sensor_faults]])
     return bool(decide_rank(stacked).rank == stacked.shape[1])
 
 
 def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tuple[str, ...]] | None:
-    """Return the proper form of a plant in which derivatives of known inputs are inputs, and what that means."""
+    """Return the proper form of a plant with derivatives of known inputs as further inputs, and a note for the user."""
     reduced = with_input_derivatives(plant)
     if reduced is None:
         return None
-    done, names = reduced
+    transformation, names = reduced
     outputs, signals = improper_outputs(plant)
     one = len(outputs) == 1
     note = (
@@ -184,7 +202,7 @@ def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tu
         f"{', '.join(signals)}: a run on a log forms {', '.join(map(repr, names))} by differences from row to row "
         "where the log has no column of that name; C code and FMUs take it as an input."
     )
-    return done, (note,)
+    return transformation, (note,)
 
 
 def _exists(plant: DescriptorSystem, method: Method) -> bool:
@@ -195,7 +213,10 @@ def _exists(plant: DescriptorSystem, method: Method) -> bool:
 
 
 def _without_improper_outputs(plant: DescriptorSystem) -> tuple[Transformation | None, tuple[str, ...]]:
-    """Return the proper form of a plant without the outputs that need derivatives, where others are left."""
+    """Return the proper form of a plant without the outputs that need derivatives, and a note.
+
+    ``None`` where no output needs one, or no other output is left.
+    """
     outputs, signals = improper_outputs(plant)
     proper_rows = [row for row, name in enumerate(plant.output_names) if name not in outputs]
     if not outputs or not proper_rows:

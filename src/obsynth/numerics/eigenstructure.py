@@ -1,9 +1,10 @@
 """Pole placement by a Sylvester equation, with repeated poles of any multiplicity.
 
-One Jordan chain for each repeated pole, which every observable pair allows: with L in real Jordan form and any G,
-``F' X - X L = C' G``, ``K = (G X^{-1})'`` gives ``spectrum(F - K C) = spectrum(L)`` (S. P. Bhattacharyya, E. de Souza,
-Systems & Control Letters 1, 1982); G by L-BFGS, its gradient by one adjoint equation.  scipy and python-control look
-for as many eigenvectors as the multiplicity: they refuse, or miss poles without a word (error 4.3 for the paper's).
+Let L be a real Jordan form of the poles, and G any matrix.  If ``F' X - X L = C' G``, then ``K = (G X^{-1})'`` gives
+``spectrum(F - K C) = spectrum(L)`` (S. P. Bhattacharyya, E. de Souza, Systems & Control Letters 1, 1982).  L-BFGS
+chooses G; one adjoint equation gives its gradient.  A repeated pole gets one Jordan chain, which every observable pair
+allows.  scipy and python-control demand as many eigenvectors as the multiplicity: they refuse, or return other poles
+without a warning (an error of 4.3 on the example of the paper).
 """
 
 from __future__ import annotations
@@ -14,56 +15,51 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.placed_noise import PlacedNoise
-from obsynth.numerics.spectra import SAME_POLE, decay_rates, pole_text, spectrum_error
+from obsynth.numerics.spectra import SAME_POLE, spectrum_error
 
-#: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
+#: Random starts of the search, and fewer for pairs with more than LARGE_PAIR states: each step of the search solves
+#: two Sylvester equations.
 STARTS, FEW_STARTS, LARGE_PAIR = 8, 2, 20
 
-#: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
-#: as long as the logarithm of the objective falls by more than this.
+#: Most L-BFGS steps of one run, and most runs.  Each run continues from the end of the last one with eigenvectors of
+#: unit length, as long as the logarithm of the objective falls by more than LEAST_PROGRESS.
 MOST_PLACEMENT_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
 
-#: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
+#: Steps after which the starts of a search for good conditioning are compared, and how many of the best are continued.
 FIRST_SEARCH_STEPS, FINALISTS = 40, 3
 
-#: Steps of the search for less noise, and how much a condition that is e times as large counts, in its logarithm.
-QUIETENING_STEPS, CONDITION_SHARE = 200, 0.05
+#: Steps of the search for less noise, and the weight of the logarithm of the squared condition in its objective.
+NOISE_SEARCH_STEPS, CONDITION_SHARE = 200, 0.05
 
-#: Less noise costs at most this factor of the condition of the best conditioned eigenvectors.
+#: The search for less noise may worsen the condition of the eigenvectors by at most this factor.
 MOST_CONDITION = 30.0
 
-#: Weights of what a condition exceeds that by, squared and in its logarithm, one after the other until it is kept.
+#: Penalty weights of the squared logarithm by which the condition exceeds that limit, tried in turn until it holds.
 EXCESS_WEIGHTS = (1.0, 30.0, 1000.0)
 
-#: Binary digits of the numbers that are searched with, of each entry and of the largest: those of a plant in other
-#: units are the same, and so is what a search of many steps ends at.
+#: Significant binary digits of the searched matrices, in each entry and relative to the largest entry.  Plants in other
+#: units have the same numbers to so many digits, so that a search of many steps ends at the same gains.
 DIGITS, DIGITS_OF_LARGEST = 20, 30
 
-#: Entries are often powers of two, which rounding would count with those above or below by chance.
+#: Offset of binary exponents: entries are often powers of two, whose exponents rounding would otherwise decide.
 OFF_THE_POWERS = 1e-3
 
-#: Seed of the starts: the same question gives the same gains.
+#: Seed of the random starts: the same problem gives the same gains.
 STARTS_SEED = 20240
 
 #: Spectra of F and L closer than this, relative to the size of F, make the Sylvester equation nearly singular: F is
 #: then shifted by a random gain first.
 OVERLAP = 1e-3
 
-#: Computed poles may miss the wanted ones by this, relative to their size.
+#: Largest error of the placed poles, relative to their size.
 PLACEMENT_TOLERANCE = 1e-5
 
 
-#: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
-PAIR_TOLERANCE = 1e-9
-
-_POLES_OPTION = "method.options.poles"
-
-
 def jordan_form(poles: Sequence[complex]) -> FloatArray:
-    """Return a real cyclic matrix ``(n, n)`` with these eigenvalues: one chain for each group of equal poles."""
+    """Return the real Jordan form ``(n, n)`` with these eigenvalues: one chain for each group of equal poles."""
     upper = [pole for pole in poles if pole.imag >= 0.0]
     groups: list[list[complex]] = []
     for pole in sorted(upper, key=lambda value: (value.real, value.imag)):
@@ -96,11 +92,23 @@ def place(
     weight: FloatArray | None = None,
     noise: PlacedNoise | None = None,
 ) -> tuple[FloatArray, float]:
-    """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of the (generalised) eigenvectors;
-    ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``.
+    """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of its (generalised) eigenvectors.
 
-    ``noise``: of these gains one near the best of the objective is taken that makes less of it; its eigenvectors have
-    at most `MOST_CONDITION` times the condition.
+    Parameters
+    ----------
+    f, c : FloatArray
+        The pair ``(n, n)``, ``(ny, n)``.
+    poles : sequence of complex
+        Closed under conjugation, ``n`` of them.
+    dt : float, optional
+        Sample time in s, 0 for continuous time.
+    objective : {"conditioning", "gain"}, optional
+        What the freedom beside the poles is spent on: well-conditioned eigenvectors, or a small gain.
+    weight : FloatArray, optional
+        Weight ``(m, n)`` of the gain in the objective "gain".
+    noise : PlacedNoise, optional
+        From the best gain on, search for one with less noise; the condition of its eigenvectors grows at most by the
+        factor `MOST_CONDITION`.
     """
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
@@ -110,7 +118,7 @@ def place(
     target, scale = jordan_form(poles), np.eye(n) if weight is None else weight
     searched_f, searched_c, searched_target = f, c, target
     if noise is not None:
-        # Only the search is in few digits: the gain of what it finds is that of the pair as it is.
+        # Only the search uses rounded matrices: its result is turned into a gain with the exact ones.
         noise, searched_target = noise.rounded(_in_few_digits), _in_few_digits(target)
         searched_f, searched_c = noise.F, noise.C
     rng = np.random.default_rng(STARTS_SEED)
@@ -123,28 +131,12 @@ def place(
         _Sylvester.of((a - first @ b).T, b.T, values, first.T, objective, scale.T @ scale)
         for a, b, values in ((f, c, target), (searched_f, searched_c, searched_target))
     )
-    best: tuple[float, FloatArray] | None = None
-    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE_PAIR else FEW_STARTS)]
-    if objective == "gain":
-        # Well-conditioned eigenvectors are a good place to start from.
-        other = replace(problem, objective="conditioning").minimised(starts[0])
-        starts = starts if other is None else [other[1], *starts]
-    if objective == "conditioning":
-        # All go a short way, and the best of them to the end.  Small gains are not predicted as early.
-        tried = [problem.minimised(start, steps=FIRST_SEARCH_STEPS, restarts=1) for start in starts]
-        ahead = sorted((candidate for candidate in tried if candidate is not None), key=lambda candidate: candidate[0])
-        starts = [start for _, start in ahead[:FINALISTS]]
-    for start in starts:
-        candidate = problem.minimised(start)
-        if candidate is not None and (best is None or candidate[0] < best[0]):
-            best = candidate
-    if best is None:
-        raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
-    if noise is not None and (quieter := problem.quieter(best[1], noise)) is not None:
+    best = _best_injection(problem, rng)
+    if noise is not None and (quieter := problem.with_less_noise(best, noise)) is not None:
         x, gain = exact.solution(quieter)
         if spectrum_error(f - (first + gain.T) @ c, poles, dt) <= PLACEMENT_TOLERANCE:
             return first + gain.T, float(np.linalg.cond(x))
-    x, gain = exact.solution(best[1])
+    x, gain = exact.solution(best)
     k = first + gain.T
     error = spectrum_error(f - k @ c, poles, dt)
     if not error <= PLACEMENT_TOLERANCE:
@@ -156,9 +148,36 @@ def place(
     return k, float(np.linalg.cond(x))
 
 
+def _best_injection(problem: _Sylvester, rng: np.random.Generator) -> FloatArray:
+    """Return the G with the least objective that searches from random starts reach."""
+    n, outputs = problem.B.shape
+    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE_PAIR else FEW_STARTS)]
+    if problem.objective == "gain":
+        # Well-conditioned eigenvectors are a good start for small gains.
+        conditioned = replace(problem, objective="conditioning").minimised(starts[0])
+        starts = starts if conditioned is None else [conditioned[1], *starts]
+    else:
+        # A few steps show which starts are worth a full search.  For small gains they do not.
+        tried = [problem.minimised(start, steps=FIRST_SEARCH_STEPS, restarts=1) for start in starts]
+        ahead = sorted((candidate for candidate in tried if candidate is not None), key=lambda candidate: candidate[0])
+        starts = [start for _, start in ahead[:FINALISTS]]
+    best: tuple[float, FloatArray] | None = None
+    for start in starts:
+        candidate = problem.minimised(start)
+        if candidate is not None and (best is None or candidate[0] < best[0]):
+            best = candidate
+    if best is None:
+        raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
+    return best[1]
+
+
 @dataclass(frozen=True, eq=False)
 class _Sylvester:
-    """``A X - X L = B G`` for many G, by one Schur form of A; L is quasi-triangular already."""
+    """The equation ``A X - X L = B G`` for many G, solved by one real Schur form of A; L is quasi-triangular.
+
+    The objective is a function of G: the condition of X, or the norm of the gain ``G X^-1 + shift`` with weight
+    ``gram``.
+    """
 
     triangular: FloatArray
     rotation: FloatArray
@@ -203,6 +222,7 @@ class _Sylvester:
         return x, np.asarray(np.linalg.solve(x.T, g.T).T)
 
     def value_and_gradient(self, flat: FloatArray) -> tuple[float, FloatArray]:
+        """Return the logarithm of the objective at the entries of G, and its gradient."""
         g = flat.reshape(self.B.shape[1], -1)
         x = self.states(g)
         inverse = np.asarray(np.linalg.inv(x), dtype=np.float64)
@@ -219,30 +239,33 @@ class _Sylvester:
         gradient = direct + self.B.T @ self.adjoint(weight)
         return float(np.log(value)), np.asarray(gradient / value).ravel()
 
-    def quieter(self, start: FloatArray, noise: PlacedNoise) -> FloatArray | None:
-        """Return a G near ``start`` whose gain makes less of the noise, with eigenvectors that are not much worse;
-        ``None`` where none is found."""
+    def with_less_noise(self, start: FloatArray, noise: PlacedNoise) -> FloatArray | None:
+        """Return a G near ``start`` whose estimates have less noise, and whose X is at most `MOST_CONDITION` times as
+        ill-conditioned; ``None`` where the search finds none."""
         g = self.normalised(start)
         try:
             x, gain = self.solution(start)
             limit = MOST_CONDITION * float(np.linalg.cond(x))
-            loudest, _ = noise.value_and_slope((gain + self.shift).T)
-            for weight in EXCESS_WEIGHTS if 0.0 < loudest < np.inf else ():
-                evaluate = self._noise_and_condition(noise, loudest, np.log(limit**2), weight)
-                before, (after, found) = evaluate(g.ravel())[0], _minimised(evaluate, g, QUIETENING_STEPS)
+            variance, _ = noise.value_and_slope((gain + self.shift).T)
+            for weight in EXCESS_WEIGHTS if 0.0 < variance < np.inf else ():
+                evaluate = self._noise_and_condition(noise, variance, np.log(limit**2), weight)
+                before, (after, quieter) = evaluate(g.ravel())[0], _minimised(evaluate, g, NOISE_SEARCH_STEPS)
                 if not after < before:
                     return None
-                if np.linalg.cond(self.states(found)) <= limit:
-                    return found
+                if np.linalg.cond(self.states(quieter)) <= limit:
+                    return quieter
         except np.linalg.LinAlgError:
             pass
         return None
 
     def _noise_and_condition(
-        self, noise: PlacedNoise, loudest: float, limit: float, weight: float
+        self, noise: PlacedNoise, reference: float, limit: float, weight: float
     ) -> Callable[[FloatArray], tuple[float, FloatArray]]:
-        """Return the logarithm of the noise, relative to ``loudest``, with what a condition counts beside it, and its
-        slope, as a function of G; ``limit`` is of the logarithm of the condition's square."""
+        """Return a function of G whose values are an objective and its gradient: noise and condition of X, weighted.
+
+        The objective is the logarithm of the variance relative to ``reference``, plus `CONDITION_SHARE` times the
+        logarithm of the squared condition, plus ``weight`` times the squared excess of the latter over ``limit``.
+        """
 
         def evaluate(flat: FloatArray) -> tuple[float, FloatArray]:
             g = flat.reshape(self.B.shape[1], -1)
@@ -258,14 +281,14 @@ class _Sylvester:
             of_states = -gain.T @ slope.T @ inverse.T / value + share * of_condition / condition
             gradient = slope.T @ inverse.T / value + self.B.T @ self.adjoint(of_states)
             counted = CONDITION_SHARE * np.log(condition) + weight * excess**2
-            return float(np.log(value / loudest) + counted), np.asarray(gradient).ravel()
+            return float(np.log(value / reference) + counted), np.asarray(gradient).ravel()
 
         return evaluate
 
     def minimised(
         self, start: FloatArray, *, steps: int = MOST_PLACEMENT_STEPS, restarts: int = RESTARTS
     ) -> tuple[float, FloatArray] | None:
-        """Return the least value found and its G; ``None`` when the equation is singular from the start."""
+        """Return the least objective that L-BFGS reaches from a start, and its G; ``None`` if X is singular there."""
         best: tuple[float, FloatArray] | None = None
         g = start
         try:
@@ -293,7 +316,7 @@ class _Sylvester:
 
 
 def _minimised(evaluate: Callable[[FloatArray], Any], start: FloatArray, steps: int) -> tuple[float, FloatArray]:
-    """Return the least value that L-BFGS finds, and where."""
+    """Return the least value that L-BFGS reaches from a start, and its argument."""
     from scipy.optimize import minimize
 
     with np.errstate(all="ignore"):
@@ -302,7 +325,7 @@ def _minimised(evaluate: Callable[[FloatArray], Any], start: FloatArray, steps: 
 
 
 def _in_few_digits(matrix: FloatArray) -> FloatArray:
-    """Return a matrix without the digits in which it may differ from one unit of the data to another."""
+    """Return a matrix rounded to so few binary digits that it is the same whatever the units of the data were."""
     largest = float(np.max(np.abs(matrix), initial=0.0))
     if largest == 0.0:
         return matrix
@@ -313,55 +336,6 @@ def _in_few_digits(matrix: FloatArray) -> FloatArray:
 
 
 def _conditioning(x: FloatArray, inverse: FloatArray) -> tuple[float, FloatArray]:
-    """Return the square of the condition in the Frobenius norm, and its slope in X."""
+    """Return the square of the condition in the Frobenius norm, and its gradient in X."""
     own, other = float(np.sum(x**2)), float(np.sum(inverse**2))
     return own * other, np.asarray(2.0 * other * x - 2.0 * own * inverse.T @ inverse @ inverse.T)
-
-
-def checked_poles(
-    requested: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
-) -> list[complex]:
-    """Return the wanted poles, in exact conjugate pairs; ``of``: what they are for, in messages."""
-    listed = [as_pole(pole) for pole in requested]
-    problems = []
-    if len(listed) != count:
-        fixed_text = ", ".join(pole_text(complex(value), 6) for value in fixed)
-        besides = f" (fixed, not to be listed: {fixed_text})" if fixed_text else ""
-        number = f"{len(listed)} {'is' if len(listed) == 1 else 'are'} given"
-        problems.append(f"{number}, but {count} can be placed{besides}.")
-    rates = decay_rates(listed, dt)
-    unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
-    if unstable:
-        where = "inside the unit circle" if dt > 0.0 else "in the left half plane"
-        problems.append(
-            f"{', '.join(pole_text(pole, 6) for pole in unstable)} would not be stable: give poles {where}."
-        )
-    upper = [pole for pole in listed if pole.imag > 0.0]
-    lower = [pole for pole in listed if pole.imag < 0.0]
-    lonely = []
-    for pole in upper:
-        partner = next((p for p in lower if abs(p - pole.conjugate()) <= PAIR_TOLERANCE * abs(pole)), None)
-        if partner is None:
-            lonely.append(pole)
-        else:
-            lower.remove(partner)
-    lonely += lower
-    if lonely:
-        poles = ", ".join(pole_text(pole, 6) for pole in lonely)
-        problems.append(f"{poles} {'lacks its conjugate' if len(lonely) == 1 else 'lack their conjugates'}.")
-    if problems:
-        raise SpecError(f"Option poles of {of}:", path=_POLES_OPTION, problems=problems)
-    real = [pole for pole in listed if pole.imag == 0.0]
-    return [*real, *(p for pole in upper for p in (pole, pole.conjugate()))]
-
-
-def as_pole(pole: Any) -> complex:
-    """Return a pole that is given as a number, or as its real and imaginary part."""
-    parts = pole if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else [pole]
-    try:
-        value = complex(*parts)
-    except (TypeError, ValueError):
-        raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES_OPTION) from None
-    if any(isinstance(part, (bool, np.bool_, str)) for part in parts) or not np.isfinite(value):
-        raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES_OPTION)
-    return value

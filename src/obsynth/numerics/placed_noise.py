@@ -1,8 +1,8 @@
-"""What noise does to estimates by an injection K, as a function of K: what given poles leave free is spent on it.
+"""Variance of estimates as a function of the injection gain K, with its gradient, for pole placement with little noise.
 
-With ``e+ = (F - K C) e + (B - K D) w`` (e' for dt = 0), w white, and estimates ``T e`` the mean square is
-``tr T P T'``, P the covariance; by Q, the Gramian of the estimates, its slope in K is
-``-2 Q ((F - K C) P C' + (B - K D) D')``, in continuous time ``-2 Q (P C' + (B - K D) D')``.
+The error is ``e+ = (F - K C) e + (B - K D) w`` (e' for dt = 0) with white noise w, and the estimates have the error
+``T e``.  Their mean square is ``tr T P T'`` with the covariance P.  With the observability Gramian Q of the estimates
+its gradient in K is ``-2 Q ((F - K C) P C' + (B - K D) D')``, in continuous time ``-2 Q (P C' + (B - K D) D')``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyap
 
 @dataclass(frozen=True, eq=False)
 class PlacedNoise:
-    """The mean square of estimates, of the errors of an injection."""
+    """The error system of an injection with white noise, and the mean square of its estimates."""
 
     F: FloatArray  # (n, n)
     C: FloatArray  # (ny, n)
@@ -28,7 +28,7 @@ class PlacedNoise:
     dt: float  # s, 0 for continuous time
 
     def rounded(self, to_digits: Callable[[FloatArray], FloatArray]) -> PlacedNoise:
-        """Return the same with matrices of fewer digits, of noise and estimates near one."""
+        """Return the same with rounded matrices, after scaling noise and estimates to size one."""
         of_noise = max(float(np.linalg.norm(self.D)), float(np.linalg.norm(self.B)), SMALLEST)
         of_estimates = max(float(np.linalg.norm(self.estimates)), SMALLEST)
         return PlacedNoise(

@@ -16,7 +16,7 @@ from rich.text import Text
 from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.automatic import SETTLING_SAMPLES
+from obsynth.methods.candidates import SETTLING_SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.guaranteed_test.method import is_guaranteed

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.methods.automatic import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
+from obsynth.methods.candidates import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import agree, design
 from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from obsynth.errors import ObsynthError
-from obsynth.methods.automatic import SETTLING_TIMES
+from obsynth.methods.candidates import SETTLING_TIMES
 from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod

@@ -16,8 +16,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_number, real_array, shown
 from obsynth.numerics.arrays import ComplexArray
-from obsynth.numerics.eigenstructure import as_pole
 from obsynth.numerics.regions import LMIRegion, NamedRegion, checked_region
+from obsynth.numerics.requested_poles import as_pole
 from obsynth.numerics.spectra import multiple_miss, pole_groups
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver

@@ -1,4 +1,4 @@
-"""The noise that a Kalman filter over a region is for: given covariances, or what drives the plant at each vertex."""
+"""Process and sensor noise of a Kalman filter over a region: stated covariances, or the plant's at each vertex."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from obsynth.plants.polytopic import PolytopicSystem
 
 @dataclass(frozen=True, eq=False)
 class NoiseOverRegion:
-    """Factors of covariances: independent unit white noise enters the equations, and the outputs, by these.
+    """Noise as factors of covariances: independent unit white noises drive the equations and the outputs by them.
 
     Parameters
     ----------
     process : tuple of FloatArray
-        ``(nx, q)`` at each vertex.
+        Noise inputs of the equations ``(nx, q)`` at each vertex.
     sensor : FloatArray
-        ``(ny, p)``.
+        Noise inputs of the outputs ``(ny, p)``.
     Q, R : FloatArray or None
-        The covariances as they are stated; None where the plant's own noise counts.
+        Stated covariances of process and sensor noise; ``None`` where the plant states its own noise.
     missing : tuple of str
-        Which of the two are identities because nothing is stated.
+        Which of ``Q`` and ``R`` are identities because neither the options nor the plant state any noise.
     """
 
     process: tuple[FloatArray, ...]
@@ -38,7 +38,7 @@ class NoiseOverRegion:
 
     @classmethod
     def of(cls, plant: PolytopicSystem, Q: Any, R: Any) -> NoiseOverRegion:
-        """Return the noise of options Q and R over a region, checked; `SpecError` for what it cannot be."""
+        """Return the noise that the options Q and R or else the plant state; raise `SpecError` where it is invalid."""
         first = plant.vertices[0]
         if (
             plant.nw
@@ -65,7 +65,7 @@ class NoiseOverRegion:
 
     @property
     def middle(self) -> FloatArray:
-        """What drives the mean of the vertices, at most: the mean of their noise inputs."""
+        """The mean of the noise inputs of the vertices, which drives the plant at the middle of the region."""
         return np.asarray(sum(self.process[1:], start=self.process[0]) / len(self.process))
 
     def stated(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class NoiseOverRegion:
 
 
 def _constant(covariance: Any, size: int, name: str) -> FloatArray | None:
-    """Return a constant covariance; ``None`` for the plant's own noise."""
+    """Return a covariance as a matrix, checked; ``None`` for the plant's own noise."""
     if covariance is None:
         return None
     if callable(covariance) or np.ndim(covariance) not in (0, 2) or isinstance(covariance, str):
@@ -86,5 +86,5 @@ def _constant(covariance: Any, size: int, name: str) -> FloatArray | None:
     matrix = as_matrix(covariance, name)
     matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(covariance) == 0 else matrix
     require_shape(matrix.shape, (size, size), name)
-    covariance_factor(matrix, name)  # refused here where it is none
+    covariance_factor(matrix, name)  # raises SpecError where the matrix is no covariance
     return matrix

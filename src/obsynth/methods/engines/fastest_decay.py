@@ -1,7 +1,8 @@
 r"""The fastest decay that inequalities at vertices allow, by Dinkelbach's iteration in place of a bisection.
 
-At a Lyapunov matrix :math:`P_k` the fastest decay is a generalised eigenvalue.  The next problem maximises at that
-decay the slack of the decay's inequality, in multiples of :math:`P_k`; its solution allows a faster one, or none does.
+For a Lyapunov matrix :math:`P_k` the fastest decay is a generalised eigenvalue.  The next problem fixes that decay and
+maximises the slack of its inequality, in multiples of :math:`P_k`.  Its solution :math:`P_{k+1}` allows a faster decay
+unless no matrix does.
 
 Reference: J.-P. Crouzeix, J. A. Ferland, S. Schaible, J. Optim. Theory Appl. 47 (1985).
 """
@@ -18,23 +19,23 @@ from obsynth.numerics.gain_levels import is_positive
 from obsynth.proofs.vertex_inequalities import Witness
 from obsynth.verification.error_polytope import ErrorPolytope
 
-#: Where the iteration ends at the latest; on random regions it took two to nine solutions.
+#: Largest number of steps; on random regions the iteration took two to nine.
 MOST_STEPS = 12
-#: The next decay that is tried lies beyond the one that was reached, by this multiple of the last progress: where the
-#: slack there is negative its solution still reaches some decay.  Where the best P is nearly singular plain ones creep.
+#: The next step tries a decay that is faster than the last one by this multiple of the last progress.  Without it the
+#: iteration creeps where the best P is nearly singular.  Its solution reaches some decay even if its slack is negative.
 OVERSHOOT = 0.5
-#: Relative progress, of a rate or of the distance of a factor to one, at which it ends: it converges faster than
-#: linearly, so that what is missing is far less (3e-6 on random regions, for a quarter less time than at 3e-4).
+#: The iteration ends at this progress, relative to a rate or to the distance of a factor to one.  It converges faster
+#: than linearly, so that far less is missing (3e-6 on random regions, in a quarter less time than with 3e-4).
 PROGRESS = 3e-3
-#: Shares, of a rate or of the distance of a factor to one, by which gains that ship are slower than the fastest: there
-#: P is nearly singular, and gains are as large as its inverse.
+#: Shipped gains are slower than the fastest by these shares of a rate, or of the distance of a factor to one: at the
+#: fastest decay P is nearly singular, and gains are as large as its inverse.
 MARGINS = (2e-3, 0.02, 0.1, 0.3)
 
 
-def fastest_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness) -> float | None:
-    """Return the fastest decay that Lyapunov matrices allow, in floating point; ``None`` where they allow none.
+def fastest_allowed_decay(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness) -> float | None:
+    """Return the fastest decay that given Lyapunov matrices allow, in floating point; ``None`` where they allow none.
 
-    A factor a sample in discrete time, else a rate in 1/s.
+    The decay is a factor per sample in discrete time, and a rate in 1/s in continuous time.
     """
     t = witness.multiplier
     if errors.ball and not t > 0.0:
@@ -54,14 +55,14 @@ def fastest_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witn
             flow = -(G.T @ M + M.T @ G)
             if errors.ball:
                 flow = flow - errors.ball**2 * t * np.eye(len(P)) - P @ P / t
-            reached.append(rate_within(flow, P))
+            reached.append(fastest_rate(flow, P))
     if any(each is None for each in reached):
         return None
     least = min(each for each in reached if each is not None)
     return -least if errors.dt > 0.0 else least
 
 
-def rate_within(flow: FloatArray, P: FloatArray) -> float | None:
+def fastest_rate(flow: FloatArray, P: FloatArray) -> float | None:
     """Return the largest a with ``flow - 2 a P`` positive semidefinite; ``None`` where ``flow`` is not definite."""
     largest = _largest(P, flow)
     return None if largest is None or largest <= 0.0 else 0.5 / largest
@@ -77,22 +78,22 @@ def _largest(above: FloatArray, below: FloatArray) -> float | None:
         return None
 
 
-def faster(
+def improved_decays(
     solved: Callable[[float, Any], tuple[float, Any] | None], rate: float, metric: Any, *, discrete: bool
 ) -> list[tuple[float, Any]]:
-    """Return decays, each faster than the one before, and the solutions that reach them.
+    """Return pairs of a decay and the solution that reaches it, each faster than the one before.
 
     Parameters
     ----------
     solved : callable
-        Of a decay and an earlier solution; it returns the decay that its own solution reaches, and this; ``None``
-        where there is none.
+        Takes a decay and an earlier solution, solves the problem at that decay, and returns the decay that the new
+        solution reaches with this solution; ``None`` where the solver finds none.
     rate : float
-        That of a first solution.
+        The decay that a first solution reaches.
     metric : any
         The first solution.
     discrete : bool
-        Whether decays are factors: the smaller the better.
+        Whether decays are factors per sample, where smaller is faster.
     """
     reached, beyond = [(rate, metric)], 0.0
     for _ in range(MOST_STEPS):
@@ -110,14 +111,18 @@ def faster(
     return reached
 
 
-def slower(fastest: float, shares: Sequence[float], slowest: float | None) -> list[float]:
-    """Return decays that are slower by shares of the way to ``slowest``, a factor; to none where that is ``None``."""
+def slower_decays(fastest: float, shares: Sequence[float], slowest: float | None) -> list[float]:
+    """Return decays that are slower by given shares of the way to ``slowest``.
+
+    ``slowest`` is a factor per sample; ``None`` means rates, for which the slowest is zero.
+    """
     if slowest is None:
         return [fastest * (1.0 - share) for share in shares]
     return [fastest + share * (slowest - fastest) for share in shares]
 
 
 def _mean(parts: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
+    """Return the weighted mean of matrices; a single matrix counts for all vertices."""
     if len(parts) == 1:
         return np.asarray(parts[0])
     return np.asarray(sum(weight * part for weight, part in zip(weights, parts, strict=True)))

@@ -1,4 +1,4 @@
-"""Gains that put all poles into a region (M. Chilali, P. Gahinet, IEEE TAC 41, 1996), with little noise."""
+"""Gains with all poles in a region (M. Chilali, P. Gahinet, IEEE TAC 41, 1996) and a small variance of estimates."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyap
 from obsynth.numerics.regions import NamedRegion
 from obsynth.numerics.spectra import eigenvalues
 
-#: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
+#: The inequalities use a region that is smaller by this share: a solution on its boundary is then inside the region.
 INNER_SHARE = 1e-3
 
-#: Weight of the states beside the estimates in what is minimised, so that no direction is free.
+#: Weight of all states in the objective, relative to the estimates: without it some directions of P have no cost.
 STATE_WEIGHT = 1e-3
 
-#: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
+#: The Lyapunov matrix is at least this multiple of the identity, in scaled states.
 LEAST_LYAPUNOV = 1e-6
 
-#: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
+#: For plants with more states the inequality moves only those poles that a Kalman gain leaves outside the region.
 MOST_MOVED_STATES = 20
 
 
 def region_gain(problem: KalmanProblem, region: NamedRegion, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
-    """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region and little noise, and the solver's record.
+    """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region, and the solver's record.
 
-    Above `MOST_MOVED_STATES` states a Kalman gain of the region's rate comes first, and the record is empty where it
-    is enough.
+    Among such gains K keeps the variance of the estimates small.  Above `MOST_MOVED_STATES` states a Kalman gain with
+    the decay rate of the region is tried first; where it is enough, the record is empty.
     """
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
-    # What one way cannot find, the other may.
+    # Each way finds gains for some plants for which the other fails.
     attempts = (
         [_by_moving_outer_poles, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _by_moving_outer_poles]
     )
@@ -65,9 +65,10 @@ def region_gain(problem: KalmanProblem, region: NamedRegion, *, solver: str) -> 
 def _by_moving_outer_poles(
     problem: KalmanProblem, region: NamedRegion, *, solver: str
 ) -> tuple[FloatArray, dict[str, Any]]:
-    """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
+    """Return a Kalman gain with the decay rate of the region, changed so that its outer poles move into the region.
 
-    With ``F - K C = V diag(T1, T2) V^-1``, T1 inside, a gain ``V [0; K2]`` makes ``T2 - K2 C V2`` of T2.
+    With ``F - K C = V diag(T1, T2) V^-1``, where T1 has the poles inside, adding ``V [0; K2]`` to the gain keeps T1
+    and replaces T2 by ``T2 - K2 C V2``.
     """
     from scipy.linalg import schur, solve_sylvester
 
@@ -96,12 +97,13 @@ def _by_moving_outer_poles(
 
 
 def _by_inequality(problem: KalmanProblem, region: NamedRegion, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    """Return a gain from the matrix inequalities of the region with the least bound on the variance of estimates."""
     n, dt = problem.F.shape[0], problem.dt
     change = _scaling(problem, region)
     inverse = np.linalg.inv(change)
     f, c = inverse @ problem.F @ change, problem.C @ change
     estimates = problem.estimates @ change
-    # The drive is left out: the region says how fast the poles must be, and less noise is what is left to ask for.
+    # The process noise `drive`, which makes a Kalman filter fast, is left out: here the region demands the speed.
     driving = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
     direct = np.hstack([problem.D, problem.background])
     size = max(largest_singular_value(estimates), SMALLEST)
@@ -143,8 +145,7 @@ def _continuous_region(region: NamedRegion, p: Any, moved: Any) -> list[Any]:
 
 
 def _scaling(problem: KalmanProblem, region: NamedRegion) -> FloatArray:
-    """Return a state change in which the error covariance of a filter of the same rate is the identity."""
-
+    """Return a change of state in which the error covariance of a Kalman filter of the same rate is the identity."""
     gain = problem.gain(region.decay)
     if gain is None:
         return np.eye(problem.F.shape[0])
@@ -152,7 +153,7 @@ def _scaling(problem: KalmanProblem, region: NamedRegion) -> FloatArray:
     noise = driving @ driving.T + problem.drive @ problem.drive.T
     noise = noise + gain @ problem.background @ problem.background.T @ gain.T
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
-        # A poor scaling is judged by what the solver makes of it.
+        # A poor scaling is no error: the solver may still find a gain, and the poles are checked.
         if problem.dt > 0.0:
             radius = np.exp(-region.decay * problem.dt)
             covariance = discrete_lyapunov(closed / radius, noise)

@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.conditions.problem import Conditions
 from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
 from obsynth.errors import SolverError
-from obsynth.methods.engines.fastest_decay import MARGINS, faster, rate_within, slower
+from obsynth.methods.engines.fastest_decay import MARGINS, fastest_rate, improved_decays, slower_decays
 from obsynth.methods.engines.vertex_certificates import (
     DECAY_ROOM,
     DECAY_SHARES,
@@ -156,11 +156,11 @@ def best_decay_of_slopes(
 
     start = solved(0.0, None)
     if start is not None:
-        reached = faster(solved, *start, discrete=False)
-        near = () if gain is not None else slower(min(reached[-1][0], limit), MARGINS, None)
+        reached = improved_decays(solved, *start, discrete=False)
+        near = () if gain is not None else slower_decays(min(reached[-1][0], limit), MARGINS, None)
         for rate, problem in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             L, witness = problem.gains()["L[1]"], _witness(problem, errors, factors, "decay", 1.0)
-            for trial in slower(min(rate, limit), DECAY_SHARES, None):
+            for trial in slower_decays(min(rate, limit), DECAY_SHARES, None):
                 if prove_decay(errors.closed(L), witness, trial, discrete=False).proved:
                     return trial, witness, L
     raise SolverError(f"No certificate of stability for the slopes was found. {_INCONCLUSIVE}")
@@ -173,7 +173,7 @@ def _fastest(errors: SlopedErrors, values: Mapping[str, FloatArray]) -> float | 
     flow = np.block([[-(GA + GA.T + errors.V.T @ T @ errors.V), -GW], [-GW.T, T]])
     P = np.zeros_like(flow)
     P[: own.order, : own.order] = values["P"]
-    return rate_within(flow, P)
+    return fastest_rate(flow, P)
 
 
 def _balanced(errors: SlopedErrors) -> tuple[SlopedErrors, FloatArray]:

@@ -18,7 +18,7 @@ from obsynth.conditions.lmi import USABLE_STATUSES
 from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
 from obsynth.methods.engines.extreme_vertices import ExtremeVertices
-from obsynth.methods.engines.fastest_decay import MARGINS, faster, fastest_of, slower
+from obsynth.methods.engines.fastest_decay import MARGINS, fastest_allowed_decay, improved_decays, slower_decays
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
 from obsynth.numerics.ranks import decide_rank
@@ -314,7 +314,7 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
     if errors.order**3 * units.errors.count > MOST_FAST or units.errors.count > MOST_FAST_VERTICES:
         return replace(first, is_fastest=False)
     moved, steps, s = units.moved(z_unit), search.options["steps"], units.states / z_unit
-    start = fastest_of(errors, first.gains, first.witness)
+    start = fastest_allowed_decay(errors, first.gains, first.witness)
     if start is None:
         return first
 
@@ -325,11 +325,11 @@ def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -
         if not has_numbers(problem, search.solver, search.settings, search.runs):
             return None
         witness, gains = witness_of(moved, problem, steps=steps)
-        reached = fastest_of(moved, gains, witness)
+        reached = fastest_allowed_decay(moved, gains, witness)
         return None if reached is None else (reached, list(witness.P))
 
-    fastest, _ = faster(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)[-1]
-    for decay in slower(fastest, DECAY_MARGINS, 1.0):
+    fastest, _ = improved_decays(solved, start, [P * s * s[:, None] for P in first.witness.P], discrete=True)[-1]
+    for decay in slower_decays(fastest, DECAY_MARGINS, 1.0):
         made = search.at(first.level, z_unit, decay, first.least)
         if made is not None:
             return made
@@ -412,21 +412,21 @@ def best_decay(
         if not has_numbers(problem, "CLARABEL", None, []):
             return None
         solution = witness_of(moved, problem, steps=steps)
-        reached = fastest_of(moved, solution[1], solution[0])
+        reached = fastest_allowed_decay(moved, solution[1], solution[0])
         return None if reached is None else (reached, solution)
 
     start = solved(slowest if discrete else 0.0, None)
     if start is not None:
-        reached = faster(solved, *start, discrete=discrete)
+        reached = improved_decays(solved, *start, discrete=discrete)
         shares = margins if margins is not None else () if gains else MARGINS
         fastest_sought = reached[-1][0] if discrete else min(reached[-1][0], limit)
-        near = slower(fastest_sought, shares, 1.0 if discrete else None)
+        near = slower_decays(fastest_sought, shares, 1.0 if discrete else None)
         for rate, (inner, scaled) in chain(filter(None, (solved(each, None) for each in near)), reversed(reached)):
             sought = [units.gain_out(L) for L in scaled] if gains is None else list(gains)
             made = sought if extreme is None or gains is not None else extreme.gains(sought)
             witness = units.witness_out(inner, 1.0)
             fastest, end = (min(rate, slowest), slowest) if discrete else (min(rate, limit), None)
-            for trial in slower(fastest, DECAY_SHARES, end):
+            for trial in slower_decays(fastest, DECAY_SHARES, end):
                 if prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved:
                     return trial, witness, made
     raise SolverError(
@@ -440,12 +440,12 @@ def proved_decay(
 ) -> float:
     """Return a decay that a given certificate proves: ``required`` where it does, else near the fastest it can."""
     vertices, discrete = errors.closed(gains), errors.dt > 0.0
-    fastest = fastest_of(errors, gains, witness)
+    fastest = fastest_allowed_decay(errors, gains, witness)
     if fastest is None:
         fastest = 0.0
     fastest = min(fastest, 1.0) if discrete else fastest
     tries = [] if required is None else [required]
-    tries += slower(fastest, DECAY_SHARES, 1.0 if discrete else None)
+    tries += slower_decays(fastest, DECAY_SHARES, 1.0 if discrete else None)
     for rate in tries:
         if prove_decay(vertices, witness, rate, discrete=discrete, ball=errors.ball).proved:
             return rate

@@ -1,4 +1,4 @@
-"""Finding a certificate for gains in hand: a Lyapunov matrix with which the shipped inequality can be proved."""
+"""Search for the certificate of given gains: a Lyapunov matrix that proves the bounded real inequality."""
 
 from __future__ import annotations
 
@@ -17,26 +17,29 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import prove_bounded_real
 
-#: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
+#: Sequences of levels, relative to the claimed one, at which coordinates are improved before a proof at the claimed
+#: level is tried.
 APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
 
-#: Weights of what the output does not show, relative to the output's, tried in turn.
+#: Weights of all states in the Riccati equation, relative to the output's weight, tried in turn.
 TAIL_WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 
-#: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
+#: Slack of the Riccati equation relative to the output weight.  The first, hence largest, one with a proof is taken.
 FILTER_SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
-#: What A and B are enlarged by, and noise on every state besides the disturbance, squared, as a share of that, which
-#: keeps states that it hardly moves from getting lost: most first.  The first leaves a hundred times the rounding of
-#: matrices of order 2,000; that one exceeds the level shows in part of a solution.
+#: Pairs, tried in turn: the share by which A and B are enlarged, and the variance of a noise on every state relative
+#: to that of the disturbance, which keeps states in the solution that the disturbance hardly moves.  The first pair
+#: leaves a hundred times the rounding errors of matrices of order 2,000.
 ROOMS = ((1e-4, 1e-7), (1e-5, 1e-8))
 
-#: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
+#: Most changes of coordinates towards ones in which the norm of the error dynamics is near one.
 MOST_CONTRACTIONS = 60
 
+#: Each change aims at the norm to this power, or at half the norm where that is less: larger steps are ill-conditioned.
 STEP_POWER = 0.75
 
-GAMMA_ABOVE_ONE = 1.05
+#: The norm of the error dynamics at which the changes of coordinates end.
+CONTRACTED_NORM = 1.05
 
 
 def bounded_real_certificate(
@@ -49,15 +52,16 @@ def bounded_real_certificate(
     lag: int,
     tries: int | None = None,
 ) -> tuple[FloatArray, bool]:
-    """Return Q ``(core, core)``, upper triangular with P = Q'Q, at level ``gain``, and whether it proves.
+    """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the level ``gain``, and whether it is a proof.
 
-    The Riccati solution with the largest slack that does, else the last try; at most ``tries`` coordinates are tried.
+    Q is the Riccati solution with the largest slack that proves the level, or else the last one.  At most ``tries``
+    changes of coordinates are tried.
     """
     errors = ErrorModel(plant, observer, tracking, lag=lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None
-    # Of many states, one solution without other coordinates has room enough, and takes a fifth of the time.
+    # For many states one Riccati solution of an enlarged system is usually enough, and takes a fifth of the time.
     for more, noise in ROOMS if core >= FEWEST_STATES and 0 < len(c) <= b.shape[1] else ():
         factor = _with_room(a, b, c, d, 1.0 + more, noise)
         if factor is None:
@@ -83,11 +87,11 @@ def bounded_real_certificate(
 def _with_room(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, more: float, noise: float
 ) -> FloatArray | None:
-    """Return Q, upper triangular, from the transposed system with noise on every state; of no more outputs than inputs.
+    """Return an upper triangular Q from the dual Riccati equation of an enlarged system; ``None`` where it has none.
 
-    Where ``Y = A Y A' + B B' + r I + (A Y C' + B D')(I - D D' - C Y C')^-1 (.)'``, the inverse of Y is a P of the
-    bounded real inequality, as strictly as r is large.  With A and B ``more`` times as large it has a share of each
-    direction's own size left, however slow the states are.
+    If ``Y = A Y A' + B B' + r I + (A Y C' + B D')(I - D D' - C Y C')^-1 (.)'``, then P = Y^-1 satisfies the bounded
+    real inequality with a slack that grows with r.  A and B are enlarged by the factor ``more``, so that the slack is
+    a share of P in each direction, even for slow states.  For systems with at most as many outputs as inputs.
     """
     scale = state_units(a, b, c)
     a, b, c = a * scale / scale[:, None], b / scale[:, None], c * scale
@@ -101,7 +105,7 @@ def _with_room(
 
 
 def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iterator[FloatArray]:
-    """Yield state changes in which a Riccati solution may prove something, the cheapest first."""
+    """Yield changes of state in which a Riccati solution may be a proof in double precision, the cheapest first."""
     for begin in (_balanced, _contracted, _unchanged):
         start = begin(a, b, c)
         inverse = np.asarray(np.linalg.inv(start))
@@ -113,19 +117,20 @@ def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iter
 
 
 def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return a diagonal state change, powers of two, in which units cost no digits."""
+    """Return a diagonal change of state, by powers of two, that balances the units of the states."""
     return np.diag(state_units(a, b, c))
 
 
 def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:
-    """Return no change: at the edge of what can be proved in double precision, other rounding errors may do."""
+    """Return the identity: its other rounding errors may allow a proof at the limit of double precision."""
     return np.eye(a.shape[0])
 
 
 def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return a state change in which the norm of ``a``, far above its spectral radius, is at most about one.
+    """Return a change of state in which the norm of ``a`` is about one, where it is far above the spectral radius.
 
-    Where the Lyapunov matrix of ``a / s`` is the identity it is below s; s shrinks in steps, each well conditioned.
+    In coordinates in which the Lyapunov matrix of ``a / s`` is the identity the norm of ``a`` is below s.  The level
+    s is lowered in steps, so that each change is well conditioned.
     """
     change, identity = _balanced(a, b, c), np.eye(a.shape[0])
     moved = np.linalg.solve(change, a @ change)
@@ -133,7 +138,7 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     for _ in range(MOST_CONTRACTIONS):
         level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
         p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
-        if norm <= GAMMA_ABOVE_ONE or not np.all(np.isfinite(p)):
+        if norm <= CONTRACTED_NORM or not np.all(np.isfinite(p)):
             break
         change = change @ normalising_change(p)
         moved = np.linalg.solve(change, a @ change)
@@ -144,9 +149,10 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 def _coordinates(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, path: tuple[float, ...], tail: float
 ) -> FloatArray | None:
-    """Return a change in which a rough Riccati solution is the identity, over the levels of ``path``; else ``None``.
+    """Return a change of state in which an approximate Riccati solution is the identity.
 
-    ``tail`` weighs states that the output does not show: as much as possible, short of what d does to them.
+    The levels of ``path`` are solved one after the other, each in the coordinates of the one before; ``None`` where
+    one has no solution.  ``tail`` is the weight of all states, which conditions those that the output does not show.
     """
     change = np.eye(a.shape[0])
     for level in path:

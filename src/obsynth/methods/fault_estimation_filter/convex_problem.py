@@ -1,4 +1,4 @@
-"""The convex problem behind Theorem 2 of Wang et al. 2015: an output injection, with a weight that may be free."""
+"""The convex problem behind Theorem 2 of Wang et al. 2015: the design of an output injection and a residual weight."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLim
 from obsynth.numerics.outward import upper_text
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
-#: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
+#: Fictitious measurement noise, relative to the given noise: with it every direction of the gains has a cost.
 BACKGROUND_NOISE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class GainParts:
-    """Fixed parts of the gains in balanced coordinates: L = L0 + R V', W = W0 + Vw V'."""
+    """Fixed parts of the gains in balanced coordinates: ``L = L0 + R V'`` and ``W = W0 + Vw V'`` with free R and Vw."""
 
     L0: FloatArray
     W0: FloatArray
@@ -28,7 +28,7 @@ class GainParts:
 
 
 def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainProblem, GainParts]:
-    """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
+    """Return the convex problem behind Theorem 2 and the fixed parts of the gains, which solve (32) exactly."""
     detectability = prepared.detectability
     upsilon = detectability.Upsilon
     w0, v = _left_inverse(upsilon), null_basis(upsilon.T)
@@ -45,7 +45,7 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
         dn = np.hstack([measure @ prepared.Dw, -background * np.eye(v.shape[1])])
         zn = np.hstack([w0 @ prepared.Dw, np.zeros((w0.shape[0], v.shape[1]))])
     else:
-        # Unit noise on the free measurements: the variance is then the size of R (and V) itself.
+        # Unit noise on the free measurements makes the variance the squared norm of R (and Vw).
         bn, dn, zn = np.zeros((na, v.shape[1])), -np.eye(v.shape[1]), np.zeros((w0.shape[0], v.shape[1]))
     problem = GainProblem(
         A=prepared.TA - l0 @ prepared.C,
@@ -63,13 +63,16 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
 
 
 def _left_inverse(upsilon: FloatArray) -> FloatArray:
-    """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
+    """Return the left inverse of least norm of a matrix of full column rank, computed in balanced units of the faults.
+
+    The units are powers of two, so that a fault in other units changes the rows by exact factors.
+    """
     units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
     return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
 
 
 def gains_in_given_units(prepared: PreparedPlant, parts: GainParts, chosen: Injection) -> dict[str, FloatArray]:
-    """Return the gains in the user's coordinates; the factors are powers of two, so this is exact."""
+    """Return the gains in the coordinates of the plant; the scaling is by powers of two and therefore exact."""
     states, equations, outputs = (
         prepared.scaling.states[:, None],
         prepared.scaling.equations,
@@ -88,7 +91,7 @@ def gains_in_given_units(prepared: PreparedPlant, parts: GainParts, chosen: Inje
 
 
 def left_inverse_near(weight: FloatArray, upsilon: FloatArray, path: str) -> FloatArray:
-    """Return the left inverse of Upsilon next to a given one, whose last digits may be missing.
+    """Return the left inverse of Upsilon nearest to a given one that has lost its last digits.
 
     Raises
     ------
@@ -110,8 +113,10 @@ def left_inverse_near(weight: FloatArray, upsilon: FloatArray, path: str) -> Flo
 def centred(
     problem: GainProblem, prepared: PreparedPlant, parts: GainParts, *, weight: FloatArray | None = None
 ) -> tuple[GainProblem, GainParts]:
-    """Return the problem written so that V = 0 is a given W, or the one of least norm in the user's output units, not
-    balanced ones."""
+    """Return the problem with its weight measured from a given W: Vw = 0 means this W.
+
+    Without ``weight``, W is the left inverse of least norm in the units of the plant's outputs, not in balanced ones.
+    """
     outputs = prepared.scaling.outputs
     upsilon = prepared.detectability.Upsilon / outputs[:, None]
     own = _left_inverse(upsilon) if weight is None else left_inverse_near(weight, upsilon, "method.options.weight")
@@ -122,12 +127,12 @@ def centred(
 
 
 def with_output_noise(problem: GainProblem, parts: GainParts) -> GainProblem:
-    """Return the problem whose second stage weighs unit noise on every output, in balanced units."""
+    """Return the problem whose second stage minimises the effect of unit noise on every output, in balanced units."""
     return replace(problem, Bn=-parts.L0, Dn=parts.V.T, Zn=parts.W0)
 
 
 def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: GainParts, bound: float) -> GainProblem:
-    """Return the problem with the norm of W bounded, in the user's output units."""
+    """Return the problem with a bound on the norm of W in the units of the plant's outputs."""
     outputs = prepared.scaling.outputs
     smallest = 1.0 / float(np.linalg.svd(prepared.detectability.Upsilon / outputs[:, None], compute_uv=False)[-1])
     if smallest >= bound:

@@ -23,9 +23,10 @@ from obsynth.errors import SolverError
 from obsynth.methods.functional_filter.assembly import FilterPart, OutputRows
 from obsynth.methods.functional_filter.kalman_gain import FilterModel
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.eigenstructure import place
 from obsynth.numerics.matrix_equations import continuous_solution, riccati_solution
 from obsynth.numerics.ranks import numerical_rank, product_but_rounding, rank_from
+from obsynth.numerics.requested_poles import checked_poles
 from obsynth.numerics.spectra import abscissa
 
 #: Beside the wanted rate, modes of the pair within this share of it are too slow: a gain could hardly move them.

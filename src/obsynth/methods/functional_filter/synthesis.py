@@ -37,8 +37,9 @@ from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.rounding import require_above_rounding
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.eigenstructure import place
 from obsynth.numerics.ranks import rounding_rank
+from obsynth.numerics.requested_poles import checked_poles
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem

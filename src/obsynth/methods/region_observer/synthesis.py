@@ -14,7 +14,7 @@ from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.slope_multipliers import SlopedErrors
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.engines.fastest_decay import rate_within
+from obsynth.methods.engines.fastest_decay import fastest_rate
 from obsynth.methods.engines.slope_certificates import best_decay_of_slopes, certified_slopes
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
@@ -340,7 +340,7 @@ def _fastest(vertices: Proved, witness: Witness) -> float:
     vertex = vertices.nominal if isinstance(vertices, SlopeBlock) else vertices[0]
     P, G = witness.P[0], witness.P[0] if witness.G is None else witness.G[0]
     GM = G.T @ vertex(Ball)[0].midpoint
-    rate = rate_within(-(GM + GM.T), P)
+    rate = fastest_rate(-(GM + GM.T), P)
     return 0.0 if rate is None else FASTEST_ROOM * rate
 
 

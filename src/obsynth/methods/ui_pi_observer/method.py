@@ -263,7 +263,7 @@ class UiPiObserver(Method):
 
     def slowest_asked(self, dt: float) -> float | None:
         """Return the least rate of decay that was asked for, in 1/s."""
-        from obsynth.numerics.eigenstructure import as_pole
+        from obsynth.numerics.requested_poles import as_pole
 
         if self.decay is not None:
             return self.decay
@@ -275,7 +275,7 @@ class UiPiObserver(Method):
 
     def resolved(self, model: Exosystem, fault_names: Sequence[str]) -> dict[str, Any]:
         """Return the options as plain data, for the gain set."""
-        from obsynth.numerics.eigenstructure import as_pole
+        from obsynth.numerics.requested_poles import as_pole
 
         listed = None if self.poles is None else [as_pole(pole) for pole in self.poles]
         return {

@@ -27,11 +27,12 @@ from obsynth.methods.ui_pi_observer.assembly import assembled
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, kalman_problem, placement_problem
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.eigenstructure import place
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.placed_noise import PlacedNoise
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.regions import NamedRegion
+from obsynth.numerics.requested_poles import checked_poles
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
