@@ -380,7 +380,10 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     if kind == "reference model":
         fits = value is None or isinstance(value, Mapping) or hasattr(value, "dt")
         fits = fits or (isinstance(value, (list, tuple)) and len(value) == 4)
-        expected = "{'bandwidth': 10}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a system of python-control"
+        expected = (
+            "{'bandwidth': 10}, {'num': [...], 'den': [...]}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a "
+            "system of python-control or scipy.signal"
+        )
         return None if fits else f"{name} is {shown(value)}: give {expected}."
     if kind == "weights":
         fits = value is None or isinstance(value, Mapping)

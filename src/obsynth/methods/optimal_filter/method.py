@@ -39,11 +39,12 @@ class OptimalFilterMethod(Method):
         Discrete time: L of the exact fault map, also as a sequence or as a mapping from names of faults.  By default
         the first delay whose least gain is within 5 % of that of the later ones; ``trade_off`` has what each delay
         gives.  Where each fault has its own, ``"auto"`` is as short as that gain allows.
-    reference : mapping, sequence of matrices or control system, optional
+    reference : mapping, sequence of matrices or linear system, optional
         What the estimate shall be of the faults: ``{"bandwidth": 10}`` in rad/s (a lag for each fault, of ``"order"``
-        1), or ``A, B, C, D`` of a stable model with nf inputs, as a mapping, in this order, or as a system of
-        python-control.  In continuous time the default is the lag of least order that has an exact fault map (with
-        ``norm="h2"`` also a finite mean square), as fast as the plant's own poles that its outputs show.
+        1), ``{"num": [5], "den": [1, 5]}``, a transfer function for each fault, or ``A, B, C, D`` of a stable model
+        with nf inputs, as a mapping, in this order, or as a system of python-control or scipy.signal.  In continuous
+        time the default is the lag of least order that has an exact fault map (with ``norm="h2"`` also a finite mean
+        square), as fast as the plant's own poles that its outputs show.
     norm : {"hinf", "h2"}, optional
         Least largest gain (of energies), or least mean square for white noise of unit intensity.
     exact : bool, optional
@@ -53,9 +54,9 @@ class OptimalFilterMethod(Method):
     weights : mapping, optional
         ``{"errors": {"fault": weight}, "inputs": {"noise": weight}}``: what errors count, and the model that forms a
         disturbance or a noise (with ``exact=False`` also a fault) from a signal of unit energy.  Each weight is a
-        number or a stable model of one input and one output, such as ``control.tf([1, 1], [1, 0.1])``, or one for
-        all of a group.  Weights of errors pass at once and have strictly stable zeros.  All claims are then of the
-        weighted problem.
+        number or a stable model of one input and one output, such as ``control.tf([1, 1], [1, 0.1])`` or
+        ``{"num": [1, 1], "den": [1, 0.1]}`` (highest power of s, or of z, first), or one for all of a group.  Weights
+        of errors pass at once and have strictly stable zeros.  All claims are then of the weighted problem.
     order_limit : int, optional
         Most states of the filter, for small processors.  Where the filter of least gain has more, one of that order
         with the same fault map and decoupling is searched; its own gain is claimed beside ``least``, which is of
@@ -220,10 +221,9 @@ class OptimalFilterMethod(Method):
 
 
 def _as_matrices(value: Any) -> Any:
-    """Return an option in which systems of python-control are mappings of their matrices."""
+    """Return an option in which systems of other packages are mappings of their matrices."""
     if hasattr(value, "dt"):
-        import control
+        from obsynth.methods.optimal_filter.stated_models import system_matrices
 
-        system = control.ss(value)
-        return {name: getattr(system, name).tolist() for name in "ABCD"}
+        return {name: matrix.tolist() for name, matrix in zip("ABCD", system_matrices(value), strict=True)}
     return {name: _as_matrices(part) for name, part in value.items()} if isinstance(value, Mapping) else plain(value)

@@ -10,8 +10,9 @@ from scipy.linalg import block_diag
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import SpecError
+from obsynth.methods.optimal_filter.stated_models import model_of
 from obsynth.numerics.arguments import is_finite_number, is_whole
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -27,20 +28,15 @@ def reference_model(reference: Any, plant: DescriptorSystem) -> Model:
         if not fits or not width > 0:
             raise SpecError("A lag is {'bandwidth': rad/s, 'order': 1}, both positive.", path=PATH)
         return lag_model(float(width), int(order), plant.nf, plant.dt)
-    model = model_of(reference, plant, "reference model", PATH)
+    model = model_of(reference, plant, "reference model", PATH, also="{'bandwidth': 10}")
     inputs = model[3].shape[1]
+    if model[3].shape == (1, 1):
+        each = np.eye(plant.nf)
+        a, b, c, d = (np.asarray(np.kron(each, part), dtype=np.float64) for part in model)
+        return a, b, c, d
     if inputs != plant.nf:
         raise SpecError(f"The reference model has {inputs} inputs; the plant has {plant.nf} faults.", path=PATH)
     return model
-
-
-def model_of(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
-    """Return ``(A, B, C, D)`` of a stable model in the time of a plant; raise `SpecError`, which says what it is."""
-    a, b, c, d = _matrices(model, plant, what, path)
-    modes = np.linalg.eigvals(a) if len(a) else np.zeros(0)
-    if np.any(np.abs(modes) >= 1.0) if plant.is_discrete else np.any(modes.real >= 0.0):
-        raise SpecError(f"The {what} is not stable: no stable filter follows it.", path=path)
-    return a, b, c, d
 
 
 def lag_model(bandwidth: float, order: int, faults: int, dt: float) -> Model:
@@ -56,50 +52,6 @@ def lag_model(bandwidth: float, order: int, faults: int, dt: float) -> Model:
 def plain(model: Model) -> dict[str, Any]:
     """Return a model as an option: lists by name."""
     return {name: part.tolist() for name, part in zip("ABCD", model, strict=True)}
-
-
-def _matrices(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
-    if isinstance(model, Mapping):
-        if set(model) - set("ABCD") or "D" not in model:
-            lag = "is {'bandwidth': 10}, or " if path == PATH else ""
-            raise SpecError(f"A {what} {lag}has matrices A, B, C and D.", path=path)
-        parts = [model.get(name, ()) for name in "ABCD"]
-    elif isinstance(model, Sequence) and not isinstance(model, str) and len(model) == 4:
-        parts = [*model]
-    elif hasattr(model, "dt"):
-        return _of_control(model, plant, what, path)
-    else:
-        lag = "{'bandwidth': 10}" if path == PATH else "a number"
-        raise SpecError(f"A {what} is {lag}, matrices (A, B, C, D), or a system of python-control.", path=path)
-    return _shaped(parts, what, path)
-
-
-def _shaped(parts: Sequence[Any], what: str, path: str) -> Model:
-    """Return matrices that fit each other."""
-    d = as_matrix(parts[3], f"{path.rpartition('.')[2]}.D")
-    rows, inputs = d.shape
-    n = len(np.atleast_2d(parts[0])) if np.size(parts[0]) else 0
-    wanted = ((n, n), (n, inputs), (rows, n))
-    matrices: list[FloatArray] = []
-    for name, part, shape in zip("ABC", parts, wanted, strict=False):
-        matrix = as_matrix(part, f"{path.rpartition('.')[2]}.{name}") if n else np.zeros(shape)
-        if matrix.shape != shape:
-            raise SpecError(f"{name} of the {what} has shape {matrix.shape}: {shape} fits A and D.", path=path)
-        matrices.append(matrix)
-    return matrices[0], matrices[1], matrices[2], d
-
-
-def _of_control(model: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
-    """Return the matrices of a system of python-control; raise `SpecError` for an improper or wrongly timed one."""
-    import control
-
-    try:
-        system = control.ss(model)
-    except (ValueError, TypeError, AttributeError, ImportError) as error:
-        raise SpecError(f"The {what} has no proper state space: {error}.", path=path) from None
-    if bool(system.dt) != plant.is_discrete or (plant.is_discrete and system.dt not in (True, plant.dt)):
-        raise SpecError(f"The {what} has dt = {system.dt}, the plant {plant.dt:g}: give both the same.", path=path)
-    return _shaped([system.A, system.B, system.C, system.D], what, path)
 
 
 def delayed(delays: Sequence[int]) -> Model:

@@ -15,9 +15,11 @@ from scipy.linalg import block_diag
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import SpecError
-from obsynth.methods.optimal_filter.reference import model_of, plain
+from obsynth.methods.optimal_filter.reference import plain
+from obsynth.methods.optimal_filter.stated_models import is_stated_model, model_of
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.least_estimation import STABLE_RADIUS
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known
 
@@ -74,7 +76,7 @@ def plain_weights(option: Any, plant: DescriptorSystem) -> Any:
     groups = {ERRORS: option.get(ERRORS), INPUTS: option.get(INPUTS)}
     weights_by_group: dict[str, Any] = {}
     for group, entry in groups.items():
-        if isinstance(entry, Mapping) and not _is_model(entry):
+        if isinstance(entry, Mapping) and not is_stated_model(entry):
             weights_by_group[group] = {str(name): _plain(one, plant, f"{group}.{name}") for name, one in entry.items()}
         elif entry is not None:
             weights_by_group[group] = _plain(entry, plant, group)
@@ -100,10 +102,6 @@ def in_series(first: Model, second: Model) -> Model:
     )
 
 
-def _is_model(entry: Mapping[str, Any]) -> bool:
-    return "D" in entry and set(entry) <= set("ABCD")
-
-
 def _plain(entry: Any, plant: DescriptorSystem, name: str) -> Any:
     return float(entry) if is_finite_number(entry) else plain(_weight(entry, plant, name))
 
@@ -112,7 +110,7 @@ def _by_name(entries: Any, names: tuple[str, ...], plant: DescriptorSystem, grou
     """Return the weights of named signals; one that is not by name is that of all of them."""
     if entries is None:
         return {}
-    if isinstance(entries, Mapping) and not _is_model(entries):
+    if isinstance(entries, Mapping) and not is_stated_model(entries):
         require_known(entries, names, what=f"{PATH}.{group}", kind="signal")
         return {name: _weight(entries[name], plant, f"{group}.{name}") for name in names if name in entries}
     weight = _weight(entries, plant, group)
@@ -138,12 +136,16 @@ def _weight(value: Any, plant: DescriptorSystem, name: str) -> Model:
 def _require_inverse(model: Model, plant: DescriptorSystem, name: str) -> None:
     a, _, _, d = model
     if d[0, 0] != 0.0:
-        zeros = np.linalg.eigvals(inverse(model)[0]) if len(a) else np.zeros(0)
-        if np.all(np.abs(zeros) < 1.0) if plant.is_discrete else np.all(zeros.real < 0.0):
+        behind = inverse(model)[0]
+        zeros = np.linalg.eigvals(behind) if len(a) else np.zeros(0)
+        # Zeros on the boundary come out beside it, on either side.
+        axis = (STABLE_RADIUS - 1.0) * float(np.linalg.norm(behind))
+        if np.all(np.abs(zeros) < STABLE_RADIUS) if plant.is_discrete else np.all(zeros.real < axis):
             return
     raise SpecError(
         f"The weight of {name} has no stable inverse: it must pass at once (as many zeros as poles) and its zeros must "
-        "be strictly stable. A zero outside may be replaced by its mirror image: the size of the weight is the same.",
+        "be strictly stable. A zero outside may be replaced by its mirror image: the size of the weight is the same. "
+        "For each zero that is missing add one beyond the frequencies that matter, as (0.001 s + 1) / (s + 1) has.",
         path=f"{PATH}.{name}",
     )
 
