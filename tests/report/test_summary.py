@@ -111,13 +111,27 @@ def test_two_specs_of_one_name_keep_their_gain_sets(tmp_path, monkeypatch, capsy
     assert len(list(tmp_path.glob("*.json"))) == 2
 
 
+def test_what_a_method_alone_asks_for_is_not_called_impossible():
+    plant = obsynth.DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], dt=1.0)
+    told = " ".join(str(obsynth.check(plant.replace(Bf=None, fault_names=None))).split())
+    assert "IMPOSSIBLE" not in told
+    assert "fault-estimation-filter: not for this plant as it is: the method's condition 'faults' FAILS." in told
+    # A state that nothing shows and that grows: no observer of these kinds exists, whatever else a method asks for.
+    hidden = plant.replace(A=[[1.2, 0.0], [0.0, 0.8]], C=[[0, 1], [0, 1]], Bf=[[0], [1]])
+    lines = " ".join(str(obsynth.check(hidden)).split())
+    assert "ui-pi-observer: IMPOSSIBLE for this plant: the condition" in lines
+    rows = obsynth.check(hidden)["ui-pi-observer"].failures
+    assert not any(check.of_the_method for check in rows)
+
+
 @pytest.mark.long
 def test_check_says_one_line_per_method(capsys):
     assert main(["check", "--system", str(DESIGNS / "filasova" / "spec.yaml")]) == 0
     printed = capsys.readouterr().out
-    # A bound on the residual's least gain asks for noise on every output, which this plant does not state.
-    assert printed.count("IMPOSSIBLE") == 1
-    assert "detection-filter: IMPOSSIBLE" in " ".join(printed.split())
+    # A bound on the residual's least gain asks for noise on every output, which this plant does not state: other
+    # residuals exist.
+    assert "IMPOSSIBLE" not in printed
+    assert "detection-filter: not for this plant as it is: the method's condition" in " ".join(printed.split())
     assert "discrete only: sample the plant first" in " ".join(printed.split())
     assert "pd-observer" in printed
     assert main(["check", "--system", str(DESIGNS / "smib" / "spec.yaml")]) == 0

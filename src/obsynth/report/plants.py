@@ -125,7 +125,8 @@ def _existence_line(method: str, report: VerificationReport, *, over_region: boo
     failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
     if {check.name for check in report.failures} & _ASKED:
         return Text(f"{method}: needs more options: {failed}.", style="yellow")
-    return Text(f"{method}: {_verdict(report.failures)} for this plant: {failed}.", style="bold red")
+    verdict, style = _verdict(report.failures)
+    return Text(f"{method}: {verdict}: {failed}.", style=style)
 
 
 def is_unclear(failed: Sequence[Check]) -> bool:
@@ -133,8 +134,13 @@ def is_unclear(failed: Sequence[Check]) -> bool:
     return bool(failed) and all(check.unclear for check in failed)
 
 
-def _verdict(failed: Sequence[Check]) -> str:
-    return "UNCLEAR" if is_unclear(failed) else "IMPOSSIBLE"
+def _verdict(failed: Sequence[Check]) -> tuple[str, str]:
+    """Return what conditions that do not hold mean for the plant, in words, and their style."""
+    if is_unclear(failed):
+        return "UNCLEAR for this plant", "bold red"
+    if failed and all(check.of_the_method or check.unclear for check in failed):
+        return "not for this plant as it is", "yellow"
+    return "IMPOSSIBLE for this plant", "bold red"
 
 
 def structure_facts(structure: Structure) -> dict[str, str]:
@@ -238,7 +244,8 @@ def method_lines(
             reason = " ".join(check.detail for check in failed if check.name in _ASKED)
             yield method, f"needs more options{own_method}: {reason}".rstrip("."), "yellow"
         else:
-            yield method, f"{_verdict(failed)} for this plant{own_method}: {_reason(failed)}", "bold red"
+            verdict, style = _verdict(failed)
+            yield method, f"{verdict}{own_method}: {_reason(failed)}", style
     if others:
         yield "for other kinds of plants", ", ".join(others), "dim"
 
@@ -264,8 +271,10 @@ def print_methods(
 def _reason(failed: Sequence[Check]) -> str:
     if not failed:
         return "no condition was checked"
-    first, *more = failed
-    sentence = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
+    # What no observer of this kind can do without comes first.
+    first, *more = sorted(failed, key=lambda check: check.of_the_method)
+    condition = "the method's condition" if first.of_the_method else "the condition"
+    sentence = f"{condition} '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
     sentence += f". Found: {first.detail}".rstrip(".") if first.detail else ""
     return f"{sentence}." + (
         f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else ""

@@ -52,6 +52,9 @@ class Check:
         Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
     unclear : bool, optional
         Of a condition that does not hold: whether double precision could not decide it.
+    of_the_method : bool, optional
+        Of a condition that does not hold: whether the method alone needs it.  It does not take the plant as it is, and
+        nothing is said of other observers.
 
     Examples
     --------
@@ -77,6 +80,7 @@ class Check:
     status: Status | Literal[""] = ""
     interval: tuple[float, float] | None = None
     unclear: bool = False
+    of_the_method: bool = False
 
     def __post_init__(self) -> None:
         if not self.status:

@@ -72,8 +72,9 @@ class VerificationReport:
         """Return the report as plain data."""
         rows = [asdict(check) for check in self.checks]
         for row in rows:
-            if not row["unclear"]:
-                del row["unclear"]
+            for key in ("unclear", "of_the_method"):
+                if not row[key]:
+                    del row[key]
         return {"passed": self.passed, "checks": rows}
 
     @classmethod

@@ -109,6 +109,7 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
             "condition",
             f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
             unclear=bool(condition.unclear),
+            of_the_method=condition.of_the_method and not condition.holds,
         )
 
 
