@@ -1,4 +1,4 @@
-"""Invariant zeros with their directions, whether they lie outside the stability region, and far out which are zeros."""
+"""Invariant zeros of a system with their directions, and which of them lie outside the stability region."""
 
 from __future__ import annotations
 
@@ -24,18 +24,21 @@ from obsynth.numerics.ranks import (
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 
-#: Where a pencil is tested between a zero and the nearest point of the stability boundary.
+#: Points at which a pencil is tested, as fractions of the way from a zero to the nearest point of the boundary.
 _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
-    """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
-    Far out a pencil with zeros at infinity is nearly singular beside ``z E`` (a chain of k states shows with ``z^-k``):
-    there a candidate counts only when the pencil is singular to rounding in units that suit its size."""
+    """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)``, without rounded zeros at infinity.
+
+    At a large ``z`` a pencil with zeros at infinity is nearly singular relative to ``z E`` (a chain of k states has a
+    singular value like ``z^-k``).  A large candidate therefore counts only if the pencil is singular to rounding in
+    units that suit its size.
+    """
     zeros = finite_zeros(E, A, to_the_end=False)
     if not zeros.values.size:
         return zeros
-    # Both of a pair are judged by the upper one.
+    # The pencil is real: a conjugate pair is decided at its member in the upper half plane.
     upper = [complex(z.real, abs(z.imag)) for z in zeros.values]
     confirmed = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, zeros.normal_rank, nx=nx) for z in upper], dtype=bool)
     return replace(zeros, values=read_only(zeros.values[confirmed], np.complex128))
@@ -62,7 +65,7 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
         if best <= BOUNDARY_RANK_TOLERANCE:
             return True
         slope = u @ pencil.E @ v
-        # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
+        # A large zero has the absolute error of the largest one: refine it by Newton's method on u' (A - z E) v.
         step: Any = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
         if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
             break
@@ -76,18 +79,23 @@ def size_of_point(value: complex) -> float:
 
 
 def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
-    """Return the pencil in units that suit a point of this modulus: states in those that ``z x`` has.
-    Beside a large ``z E`` the inputs and outputs would vanish."""
+    """Return the equilibrated pencil in units for points of this modulus, in which ``z x`` instead of x is near one.
+
+    In other units inputs and outputs would be negligible beside a large ``z E``.
+    """
     size = size_of_point(value)
     columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
-    # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
+    # E is multiplied by the modulus for the scaling and divided again, so that the factors suit A - z E.
     scaled = equilibrate_pencil(size * columns * E, columns * A)
     return EquilibratedPencil(scaled.E / size, scaled.A, scaled.rows, read_only(scaled.columns * columns))
 
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """An invariant zero, its direction of unit norm, and the input's share of that when the pencil is equilibrated."""
+    """An invariant zero with its direction of unit norm.
+
+    ``input_share`` is the norm of the input's part of the direction in equilibrated units.
+    """
 
     value: complex
     state_direction: ComplexArray
@@ -96,7 +104,7 @@ class Zero:
 
     @property
     def is_unobservable_mode(self) -> bool:
-        """Whether the input takes no part: the zero is a mode that the outputs never show."""
+        """Whether the direction has no input part: the zero is an unobservable mode."""
         return self.input_share <= NEGLIGIBLE_INPUT
 
 
@@ -109,29 +117,31 @@ def is_outside(value: complex, dt: float) -> bool:
 
 def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> tuple[bool, ...]:
     """Decide for each finite zero of ``A - z E`` whether it counts as not strictly stable.
-    One of multiplicity k moves by ``eps^(1/k)``: near the boundary it also counts as outside when the pencil is
-    singular to working precision all the way to the nearest boundary point."""
-    judged: PencilPoints | EquilibratedPencil | None = None
+
+    Rounding moves a zero of multiplicity k by about ``eps^(1/k)``.  A zero near the boundary therefore also counts as
+    outside if the pencil is singular to working precision all the way to the nearest boundary point.
+    """
+    tested: PencilPoints | EquilibratedPencil | None = None
     outside: dict[complex, bool] = {}
     for value in map(complex, zeros.values):
         distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
-        # Of a pair both are where the one before was found to be: the pencil is real.
+        # The pencil is real, so that both zeros of a conjugate pair lie on the same side.
         if (other := value.conjugate()) in outside:
             outside[value] = outside[other]
         elif is_outside(value, dt) or distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
             outside[value] = is_outside(value, dt)
         else:
-            if judged is None:
-                judged = pencil = equilibrate_pencil(E, A)
-                # A large one of full column rank is made ready for many points.
+            if tested is None:
+                tested = pencil = equilibrate_pencil(E, A)
+                # A large pencil of full column rank is reduced once, for fast tests at many points.
                 if min(E.shape[0], zeros.normal_rank) >= E.shape[1] >= FEW_COLUMNS:
-                    judged = PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
-            outside[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
+                    tested = PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
+            outside[value] = _reaches_boundary(tested, value, dt, zeros.normal_rank)
     return tuple(outside[value] for value in map(complex, zeros.values))
 
 
 def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
-    """Return the zero of ``[A - z E, B; C, D]`` that is known to be at a point, with its direction there."""
+    """Return a zero of ``[A - z E, B; C, D]`` with its direction; the caller knows that it lies at ``value``."""
     wide_e, wide_a = system_pencil(E, A, B, C, D)
     nx = E.shape[0]
     pencil = equilibrated_at(wide_e, wide_a, value, nx=nx)
@@ -142,7 +152,7 @@ def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: Floa
 def zeros_of_system(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None, *, dt: float
 ) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
-    """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
+    """Return the zeros of ``[A - z E, B; C, D]``: their values, with directions, and those not strictly stable."""
     e, a = system_pencil(E, A, B, C, D)
     finite = system_zeros(e, a, nx=E.shape[0])
     zeros = zeros_with_directions(e, a, finite, nx=E.shape[0])
@@ -153,7 +163,7 @@ def zeros_of_system(
 def system_pencil(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``[A - z E, B; C, D]`` as its two matrices."""
+    """Return the matrices ``[E, 0; 0, 0]`` and ``[A, B; C, D]`` of the pencil ``[A - z E, B; C, D]``."""
     feedthrough = np.zeros((C.shape[0], B.shape[1])) if D is None else D
     padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
     padded[: E.shape[0], : E.shape[1]] = E
@@ -161,8 +171,9 @@ def system_pencil(
 
 
 def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
+    """Whether the pencil is singular to working precision all the way from a zero to the stability boundary."""
     point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
-    # All the way to the boundary: another zero that lies there is no evidence about this one.
+    # Several points on the way: at the boundary alone another zero may make the pencil singular.
     for fraction in _PATH_TO_BOUNDARY:
         place = value + fraction * (point - value)
         place = place if place.imag else place.real
@@ -179,14 +190,17 @@ def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex,
 def zeros_with_directions(
     E: FloatArray, A: FloatArray, finite: FiniteZeros, *, nx: int, selected: Callable[[complex], bool] = lambda _: True
 ) -> tuple[Zero, ...]:
-    """Return zeros of the system pencil ``A - z E`` with their directions: all, or the wanted ones; of a pair both."""
+    """Return the zeros of the system pencil ``A - z E`` with their directions.
+
+    ``selected`` chooses zeros by their values; it has to treat both zeros of a conjugate pair alike.
+    """
     values = [complex(value) for value in finite.values]
     zeros: list[Zero] = []
     for i, value in enumerate(values):
         if not selected(value):
             continue
         if value.imag < 0.0:
-            # Pairs follow each other and are exact.
+            # `finite_zeros` returns exact conjugate pairs, upper half plane first.
             state, driving = (
                 read_only(part.conj(), np.complex128) for part in (zeros[-1].state_direction, zeros[-1].input_direction)
             )
@@ -195,8 +209,9 @@ def zeros_with_directions(
         pencil = equilibrated_at(E, A, value, nx=nx)
         kernel = _kernel(pencil, value, least=pencil.A.shape[1] - finite.normal_rank + 1)
         basis = smallest_part_first(kernel, slice(nx, None))
-        twins = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])
-        zeros.append(_zero_along(basis[:, min(twins, basis.shape[1] - 1)], value, pencil.columns, nx=nx))
+        # The zeros of one cluster take different directions of the null space.
+        place = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])
+        zeros.append(_zero_along(basis[:, min(place, basis.shape[1] - 1)], value, pencil.columns, nx=nx))
     return tuple(zeros)
 
 
@@ -212,7 +227,7 @@ def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArra
 
 
 def smallest_part_first(basis: NDArray[Any], part: slice) -> NDArray[Any]:
-    """Rotate an orthonormal basis so that the columns' rows in ``part`` grow from first to last."""
+    """Rotate an orthonormal basis so that the norm of the rows ``part`` grows from the first to the last column."""
     if basis.shape[1] == 1 or basis[part].size == 0:
         return basis
     _, _, rotation = np.linalg.svd(basis[part])
@@ -220,6 +235,7 @@ def smallest_part_first(basis: NDArray[Any], part: slice) -> NDArray[Any]:
 
 
 def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, nx: int) -> Zero:
+    """Return a zero with its direction in the original units, of unit norm and with a positive largest entry."""
     original = scale * direction
     leading = original[np.argmax(np.abs(original))]
     original = original * (abs(leading) / leading / np.linalg.norm(original))

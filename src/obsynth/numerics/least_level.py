@@ -1,7 +1,8 @@
-"""The least level of a central H-infinity equation: where the margin of its solutions vanishes.
+"""Gamma iteration: the least level of a central H-infinity equation, at which the margin of its solutions vanishes.
 
-With u the squared level and m(u) u the margin, which grows at least as fast as u, ``u (1 - m)`` is a lower bound, and a
-parabola through the last levels reached leads to the least in a few steps.
+Let u be the squared level and m the relative margin.  The margin m u grows at least as fast as u, so that
+``u (1 - m)`` is a lower bound of the least squared level.  A parabola through the last three levels with a solution
+leads to the least level in a few steps.
 """
 
 from __future__ import annotations
@@ -12,40 +13,42 @@ from dataclasses import dataclass, field
 from obsynth.numerics.central_equation import CentralEquation
 from obsynth.numerics.injection_problem import Injection
 
+#: Most levels that are tried; a bisection alone narrows a bracket to a share of 1e-15 in 50.
 MOST_LEVELS = 60
 
-#: Shares of the distance to where the margin should vanish, told by one level or by two, by which the next stays above
-#: that; with three levels, a share of the distance between the last two estimates.
+#: The next level lies above the estimate of the least one by this share of a distance.  The keys are the numbers of
+#: levels that the estimate uses: with one or two the distance is that from the last level to the estimate, with three
+#: that between the last two estimates.
 SAFETY = {1: 0.01, 2: 0.1, 3: 0.2}
 
-#: A margin below this belongs to a level next to the least.
+#: A relative margin below this means that the level is the least one in double precision.
 SMALL_MARGIN = 1e-5
 
-#: Growth of that share with each level that fails.
+#: Factor by which each failing level enlarges the safety share.
 CAUTION = 10.0
 
-#: Levels that may fail in a narrow bracket where rounding is to be expected.
+#: Failing levels that end the iteration in a narrow bracket where rounding errors are expected.
 MOST_FAILURES = 3
 
-#: A margin is at most one, up to rounding, or the solution is not the one looked for.
+#: The relative margin of a stabilising solution is at most one, up to rounding.
 MOST_MARGIN = 1.0 + 1e-6
 
-#: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
+#: A filter whose true gain exceeds its level by more than this share shows that the equation was not solved.
 NORM_EXCESS = 2e-3
 
-#: Steps away from a level that the true gain exceeds, each longer than the one before, and halvings (of their
-#: logarithm) back.
+#: Factor between steps upwards from a level that the true gain exceeds.
 RETREAT = 10.0
 
+#: Bisections, on a logarithmic scale, of the last such step.
 HALVINGS = 2
 
-#: Relative distance to the best gain from which a first level that fails ends the descent.
+#: The iteration ends where its first level fails and lies this close to the best known gain, relative to that.
 NEXT_TO = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """A level at which the equation has a solution of the right signs, and its margin and central filter."""
+    """A level at which the equation has a stabilising solution, with its relative margin and central filter."""
 
     level: float
     margin: float
@@ -54,11 +57,26 @@ class Reached:
 
 @dataclass(eq=False)
 class GammaIteration:
-    """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
+    """A descent from ``high`` to the least level.
 
-    ``settled``: the margin tells that nothing is below; ``expects_rounding``: the first filter is judged and a few
-    failures in a narrow bracket end it; ``judged``: a level counts only when the true gain of its filter is within it;
-    ``evaluated``: the filters whose true gain was asked for.
+    Parameters
+    ----------
+    equation : CentralEquation
+        The equation, which has solutions at all levels above the least one.
+    low, high : float
+        The bracket of the least level.
+    tolerance : float
+        Relative width of the bracket at which the descent ends.
+    reached : list of Reached
+        Levels with a solution, each lower than the one before.
+    settled : bool
+        Whether the margin shows that no lower level has a solution.
+    expects_rounding : bool
+        Check the true gain of the first filter, and end after a few failures in a narrow bracket.
+    judged : bool
+        A level counts only if the true gain of its filter does not exceed it.
+    evaluated : list
+        Filters with their true gains, where these were computed.
     """
 
     equation: CentralEquation
@@ -72,7 +90,7 @@ class GammaIteration:
     evaluated: list[tuple[Injection, float]] = field(default_factory=list)
 
     def run(self, first: float) -> None:
-        """Go down from ``first``; where that is not reached and close to ``high``, nothing below is looked for."""
+        """Descend from the level ``first``; end at once if it fails and lies close to ``high``."""
         level, caution, failures = first * (1.0 + self.tolerance), 1.0, 0
         for _ in range(MOST_LEVELS):
             if level >= self.high * (1.0 - 0.5 * self.tolerance):
@@ -93,16 +111,16 @@ class GammaIteration:
             level = self._next_level(caution)
 
     def _is_credible(self, level: float, margin: float, injection: Injection) -> bool:
-        """Whether the margin has shrunk with the level, without which the solution is not the one looked for."""
+        """Whether the margin has shrunk with the level, as that of the stabilising solution does."""
         if margin > MOST_MARGIN:
             return False
         if self.reached and margin * level**2 >= self.reached[-1].margin * self.reached[-1].level ** 2:
             return False
-        believed = not self.judged and (not self.expects_rounding or bool(self.reached))
-        return believed or self._gain_within(injection, level) is not None
+        needs_no_check = not self.judged and (not self.expects_rounding or bool(self.reached))
+        return needs_no_check or self._gain_within(injection, level) is not None
 
     def _next_level(self, caution: float) -> float:
-        """Return the level to try: a little above where the margin should vanish."""
+        """Return the next level: a little above the estimate at which the margin vanishes, or the middle."""
         middle = 0.5 * (self.low + self.high)
         points = [(item.level**2, item.margin * item.level**2) for item in self.reached[-3:]][::-1]
         if not points or (caution > 1.0 and len(points) < len(SAFETY)):
@@ -125,7 +143,7 @@ class GammaIteration:
     def best(self) -> tuple[Injection, float] | None:
         """Return the filter of the lowest level that its true gain does not exceed, and that gain, if there is one.
 
-        Next to the least level, where the margin vanishes, rounding may let the true gain exceed the level.
+        Close to the least level rounding errors may let the true gain exceed the level.
         """
         if not self.reached:
             return None
@@ -146,27 +164,28 @@ class GammaIteration:
         return within
 
     def judged_again(self, high: float) -> GammaIteration:
-        """Return a descent in which each filter is judged by itself, down to the lowest level that failed."""
+        """Return a second descent from ``high`` in which the true gain of each filter is checked."""
         top, last = self.reached[0].level, self.reached[-1].level
         first_fails = self._gain_within(self.reached[0].injection, top) is None
-        again = GammaIteration(self.equation, top if first_fails else last, high, self.tolerance, judged=True)
-        again.run(0.5 * (top + high) if first_fails else top)
-        return again
+        descent = GammaIteration(self.equation, top if first_fails else last, high, self.tolerance, judged=True)
+        descent.run(0.5 * (top + high) if first_fails else top)
+        return descent
 
     def _filter_within(self, level: float) -> tuple[Injection, float] | None:
-        """Return the filter of a level and its true gain where the level is not exceeded."""
+        """Return the filter of a level and its true gain; ``None`` where the gain exceeds the level."""
         injection = self.equation.filter_at(level)
         gain = None if injection is None else self._gain_within(injection, level)
         return None if injection is None or gain is None else (injection, gain)
 
     def _gain_within(self, injection: Injection, level: float) -> float | None:
+        """Return the true gain of a filter; ``None`` where it exceeds the level."""
         gain = self.equation.problem.achieved_gain(injection)
         self.evaluated.append((injection, gain))
         return gain if gain <= level * (1.0 + self.tolerance) else None
 
 
 def place_of_zero_margin(points: list[tuple[float, float]]) -> float:
-    """Return where u is for a margin of zero, by the polynomial in the margin through points (u, margin)."""
+    """Return u at margin zero by interpolation: u is the polynomial in the margin through points (u, margin)."""
     total = 0.0
     for i, (u, margin) in enumerate(points):
         other_margins = [m for j, (_, m) in enumerate(points) if j != i]

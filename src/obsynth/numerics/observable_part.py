@@ -1,7 +1,8 @@
-"""Splitting a pair into its observable part and the modes that no gain moves: Share Pasand et al., procedure 1, step 7.
+"""Decomposition of a pair into its observable part and its fixed modes: Share Pasand et al., procedure 1, step 7.
 
-Lemma 6 (always observable) is false.  A staircase of rank decisions loses its way on large stiff pairs; the fixed modes
-are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time.
+Their Lemma 6 (the pair is always observable) is false.  A staircase of rank decisions fails on large stiff pairs.  The
+fixed modes, however, are zeros of the plant's pencil, so that the unobservable part is split off one eigenspace at a
+time.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.spectra import eigenvalues
 
-#: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
-#: rounding split lies at about the square root of the unit roundoff from it.
+#: Fixed modes closer than this, relative to their size, are split off together, at their mean: rounding moves a double
+#: mode by about the square root of the unit roundoff.
 SAME_MODE = 1e-5
 
-#: Entries below this share of the largest are no links by which states are balanced: units of a plant, which are found
-#: to some 1e-9, may leave so much of products that would be zero.
+#: Entries below this share of the largest one count as zero when states are balanced: units of the plant have relative
+#: errors of about 1e-9, which leave so much of products that would be zero.
 LEAST_LINK = 1e-8
 
 
@@ -31,7 +32,7 @@ class ObservableSplit:
     """``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``."""
 
     basis: FloatArray  # (n, n), orthogonal
-    units: FloatArray  # (n,): the states are balanced first
+    units: FloatArray  # (n,), of the balanced states
     F: FloatArray  # F_o (no, no)
     C: FloatArray  # C_o (ny, no)
     fixed_modes: ComplexArray  # of the hidden part
@@ -42,7 +43,7 @@ class ObservableSplit:
         return int(self.F.shape[0])
 
     def lift(self, gain: FloatArray) -> FloatArray:
-        """Return the gain ``(n, ny)`` of the whole pair for one of the observable part ``(no, ny)``."""
+        """Return the gain ``(n, ny)`` of the whole pair that belongs to a gain ``(no, ny)`` of the observable part."""
         return np.asarray(self.units[:, None] * (self.basis[:, : self.order] @ gain))
 
     def observable_rows(self, matrix: FloatArray) -> FloatArray:
@@ -57,29 +58,31 @@ class ObservableSplit:
 def observable_split(
     f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *, dt: float, exact_rows: int = 0
 ) -> ObservableSplit:
-    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``; the last ``exact_rows`` of F are no
-    products.
+    """Return the observable part of the pair ``(F, C)``, from its known fixed modes.
 
-    A stable mode that is fixed by the zeros of the plant's pencil, but that the pair shows, is left where it shows: it
-    decays with or without a gain.  An unstable one cannot be left, and is refused."""
+    ``f (n, n)``, ``c (ny, n)``; the last ``exact_rows`` rows of F are no rounded products.
+
+    By rounding a fixed mode may be observable in the pair.  If it is stable, it stays in the observable part, where it
+    decays with or without a gain.  If it is unstable, `PreconditionError` is raised.
+    """
     n = f.shape[0]
     units = _balancing(f, c, exact_rows)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
     size = max(largest_singular_value(work_f), largest_singular_value(work_c)) if n else 1.0
-    waiting: list[complex] = []
+    modes: list[complex] = []
     for mode in map(complex, fixed_modes):
         if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
-            waiting.append(complex(mode.real, 0.0))
+            modes.append(complex(mode.real, 0.0))
         elif mode.imag >= 0.0:
-            waiting.append(mode)
+            modes.append(mode)
     visible = n
-    while waiting:
-        value = waiting[0]
-        cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
+    while modes:
+        value = modes[0]
+        cluster = [other for other in modes if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
         kernel = _hidden_directions(work_f[:visible, :visible], work_c[:, :visible], sum(cluster) / len(cluster), size)
         count = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
         if count == 0 and not any(is_outside(other, dt) for other in cluster):
-            waiting = [other for other in waiting if other not in cluster]
+            modes = [other for other in modes if other not in cluster]
             continue
         if count == 0 or (count > len(cluster) and is_outside(value, dt)):
             raise PreconditionError(
@@ -89,19 +92,19 @@ def observable_split(
                 mode=value,
             )
         turn = np.eye(n)
-        # Observable directions first, the hidden ones behind them.
+        # Observable directions come first, the unobservable ones of this mode last.
         directions = np.linalg.svd(kernel)[0]
         turn[:visible, :visible] = np.hstack([directions[:, kernel.shape[1] :], directions[:, : kernel.shape[1]]])
         work_f, work_c, basis = turn.T @ work_f @ turn, work_c @ turn, basis @ turn
         visible -= kernel.shape[1]
         for other in cluster[:count]:
-            waiting.remove(other)
+            modes.remove(other)
     hidden = eigenvalues(work_f[visible:, visible:])
     return ObservableSplit(basis, units, work_f[:visible, :visible], work_c[:, :visible], hidden)
 
 
 def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
-    """Return a real orthonormal basis of the states that stay invisible at the mode, and at its conjugate."""
+    """Return a real orthonormal basis of the unobservable eigenspace of a mode and its conjugate."""
     shifted = f - (value if value.imag else value.real) * np.eye(f.shape[0])
     _, values, right = np.linalg.svd(np.vstack([shifted, c]))
     kernel = right[values <= HIDDEN_MODE_TOLERANCE * max(size, abs(value))].conj().T
@@ -115,12 +118,12 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray, exact_rows: int) -> FloatArray:
-    """Return state factors that make entries of F, and of C, alike; F's size is free, as it may be reducible."""
+    """Return scale factors of the states that balance the entries of F and the columns of C; the scale of F is free."""
     n = f.shape[0]
     problem = LogBalance(n + 2)
     states = range(n)
     links = np.where(np.eye(n, dtype=bool), 0.0, f)
-    # All outputs together: which combinations of them are looked at must not matter.
+    # The norms of C's columns, so that the units do not depend on the choice of output combinations.
     output_sizes = np.linalg.norm(c, axis=0, keepdims=True)
     largest_f, largest_c = (float(np.max(np.abs(part), initial=0.0)) for part in (f, output_sizes))
     floors = np.full((n, 1), LEAST_LINK * largest_f)

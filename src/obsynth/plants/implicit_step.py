@@ -1,8 +1,8 @@
-"""One implicit step of a DAE: Newton, then homotopy in the input, with sensitivities and the residual that is left.
+"""One implicit step of a DAE: Newton's method, a homotopy in the input where it fails, and the step's sensitivities.
 
-As CasADi functions the iteration is the undamped one of `obsynth.numerics.newton`; where that would damp, lead the
-input along a homotopy, or give up, the step is not to be trusted, and `ImplicitStep.solve_carefully` takes it, with
-the same function for the Newton step.
+The compiled step runs the undamped iteration of `obsynth.numerics.newton` as one CasADi function.  Where damping or a
+homotopy is needed it returns a step that is not trusted.  `ImplicitStep.solve_carefully` then solves the step, with the
+same function for the Newton direction.
 """
 
 from __future__ import annotations
@@ -21,37 +21,52 @@ from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import Compiled, DAEFunctions
 
-#: Iterations that every step takes, and further ones in blocks for those that need them.  From the last sample's state
-#: three or four are the rule.
+#: Numbers of iterations in blocks: every step runs the first block, and a further one only if it has not converged.
+#: Three or four iterations from the state of the last sample are usual.
 BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 
-#: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
+#: First step of a homotopy, as a share of the change of the input; doubled after a success, halved after a failure.
 FIRST_FRACTION = 0.125
 
-#: A homotopy that needs smaller fractions than this, or more sub-solves, is not going anywhere.
+#: A homotopy fails when it needs a smaller step than this.
 LEAST_FRACTION = 2.0**-20
 
+#: A homotopy fails when it needs more solutions by Newton's method than this.
 MOST_SUBSOLVES = 10_000
 
-#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
+#: A state is projected onto the algebraic equations by a step of backward Euler over this share of dt, in which the
+#: dynamic states hardly move.
 PROJECTION_SHARE = 1e-6
 
-#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
+#: A smaller move in that step, relative to the sizes of the states, is motion and not a projection.
 PROJECTION_NOTICE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class StepGraph:
-    """The functions of one implicit step of fixed length."""
+    """The CasADi functions of one implicit step of fixed length.
 
-    newton: Any  # (stages, state before, input, parameters) -> residual, row scales, step
-    sensitivities: Any  # the same -> F of (8), G of (9), that of what is added, the matrix of (7)
-    step: Any  # the same -> stages, residual, 1 if trusted
-    small: bool  # all is scalar operations
+    Parameters
+    ----------
+    newton : casadi.Function
+        ``(stages, state before, input, parameters)`` to residual, row scales and Newton step.
+    sensitivities : casadi.Function
+        The same arguments to F of (8), G of (9), the derivative by what is added to the equations, and the
+        equilibrated matrix of (7).
+    step : casadi.Function
+        ``(state before, input, parameters)`` to stages, residual, and 1 if the step is trusted.
+    small : bool
+        Whether the functions are expanded into scalar operations.
+    """
+
+    newton: Any
+    sensitivities: Any
+    step: Any
+    small: bool
 
 
 def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
-    """Return the functions of one implicit step."""
+    """Return the functions of one implicit step, cached with the model."""
     graphs, key = functions.model.graphs, (functions.method, dt, largest_move)
     if key not in graphs:
         graphs[key] = _graph(functions, dt, largest_move)
@@ -99,8 +114,8 @@ def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph
 
 
 def input_effect(functions: DAEFunctions, dt: float) -> Any:
-    """Return the function from stages, state before, input and parameters to the derivative of a solved step by the
-    input ``(nx, nu)``."""
+    """Return a function of stages, state before, input and parameters: the derivative ``(nx, nu)`` of the step by the
+    input."""
     model, stages = functions.model, functions.stages
     n = model.nx * stages
     sizes = np.tile(model.state_scales, stages)
@@ -114,7 +129,7 @@ def input_effect(functions: DAEFunctions, dt: float) -> Any:
 
 
 def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> Any:
-    """Return the step: blocks of iterations, the later ones taken only where the earlier have not ended."""
+    """Return the whole step as one function: blocks of iterations, each run only if the one before has not ended."""
     point = [ca.MX.sym("x", len(sizes) // stages), *(ca.MX.sym(name, newton.size1_in(i)) for i, name in ((2, "u"),
              (3, "theta")))]  # fmt: skip
     start = ca.repmat(point[0], stages, 1)
@@ -136,12 +151,16 @@ def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> 
 
 
 def _iteration(newton: Any, sizes: FloatArray) -> Any:
-    """Return one iteration, from and to stages, residual, row scales, Newton step, and whether and how it ended."""
+    """Return one iteration as a function, which does nothing once it has ended.
+
+    It maps stages, residual, row scales, Newton step, and the flags ``done``, ``converged`` and largest residual to
+    their new values.
+    """
     inputs = [newton.mx_in(0)] + [ca.MX.sym(name, len(sizes)) for name in ("value", "rows", "move")]
     inputs += [ca.MX.sym(name) for name in ("done", "converged", "residual")]
     point = [newton.mx_in(i) for i in (1, 2, 3)]
     X, value, rows, move, done, converged, residual = inputs
-    # A comparison with what is not a number is false, so that it never converges.
+    # Comparisons with NaN are false, so that an iteration with NaN never converges.
     last = _all(ca.fabs(move) <= LAST_STEP * ca.fmax(ca.fabs(X), ca.DM(sizes)))
     after = [X + move, *newton(X + move, *point)]
     reached = ca.fabs(rows * after[1])
@@ -156,7 +175,7 @@ def _iteration(newton: Any, sizes: FloatArray) -> Any:
 
 
 def _block(iteration: Any, count: int) -> Any:
-    """Return so many iterations as one function."""
+    """Return ``count`` iterations as one function."""
     inputs = iteration.mx_in()
     state, point = inputs[: iteration.n_out()], inputs[iteration.n_out() :]
     for _ in range(count):
@@ -171,7 +190,7 @@ def _all(conditions: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The state ``x (nx,)`` after a step, its stages, the residual in sizes of the states, Newton iterations begun."""
+    """The state ``x (nx,)`` after a step, its stages, its residual in sizes of the states, and the number of solves."""
 
     x: FloatArray
     stages: FloatArray
@@ -180,7 +199,11 @@ class Solution:
 
 
 class ImplicitStep:
-    """Steps of dt s; moves beyond ``largest_move`` in parts along a homotopy, to the root connected with the last."""
+    """Implicit steps of dt s.
+
+    A step that moves a state by more than ``largest_move`` follows a homotopy in the input, so that it ends at the
+    root that is connected with the last state.
+    """
 
     def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
         self.functions, self.dt = functions, dt
@@ -226,7 +249,7 @@ class ImplicitStep:
     def sensitivities(
         self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the derivatives of a step that was solved: F (8), G (9), and of what is added to the equations."""
+        """Return the derivatives of a solved step by state (F of (8)), parameters (G of (9)) and equation noise."""
         F, G, noise, _ = self._local(solution.stages, x, u, theta)
         if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
             raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")
@@ -240,7 +263,7 @@ class ImplicitStep:
         return Compiled(newton_graph(self.functions, self.dt))
 
     def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
-        """Solve from a start by the function that C has, so that both decide alike where rounding decides."""
+        """Solve from a start with the function that the C code contains, so that both round alike."""
 
         def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             value, rows, step = self._evaluated(stages, x, u, theta)
@@ -298,6 +321,6 @@ class ImplicitStep:
 
 
 def onto_constraint(model: DAEModel, x: FloatArray, u: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
-    """Return a state on the algebraic equations: the given one ``x (nx,)`` where it is on them already."""
+    """Return the state ``x (nx,)`` projected onto the algebraic equations; ``x`` itself where it satisfies them."""
     projected = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt).solve_carefully(x, u, theta).x
     return projected if np.abs((projected - x) / model.state_scales).max() > PROJECTION_NOTICE else x

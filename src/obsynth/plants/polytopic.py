@@ -4,8 +4,8 @@ r"""Polytopic (linear parameter-varying) descriptor systems: plants whose matric
     E x^+ = A(\mu) x + B(\mu) u + B_d(\mu) d + B_f(\mu) f + B_w(\mu) w, \qquad
     y = C(\mu) x + D(\mu) u + D_d(\mu) d + D_f(\mu) f + D_w(\mu) w
 
-where every matrix is the mean, with weights :math:`\mu(\rho)` of the simplex, of those at the vertices, and the
-scheduling parameters :math:`\rho` are measured at the same sample as y.  E is the same at all vertices.
+Every matrix is a weighted mean of its values at the vertices.  The weights :math:`\mu(\rho)`, on the simplex, follow
+from the scheduling parameters :math:`\rho`, which are measured at the same sample as y.  E is the same at all vertices.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from obsynth.plants.uncertainty import expressions_in
 
 #: Matrices that may change over a region.
 SCHEDULED_MATRICES = ("A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-#: What the vertices of one plant have in common.
+#: Properties that all vertices of a plant have to share.
 _SHARED = ("dt", "state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
 
 
@@ -39,21 +39,20 @@ class PolytopicSystem:
     Parameters
     ----------
     vertices : sequence of DescriptorSystem, optional
-        One or more (or their `as_dict`), with the same E, sample time and names of signals.  The weights of the
-        vertices are then the scheduling parameters, named ``weight1, weight2, ...``, unless ``scheduling`` says
-        otherwise.
+        One or more plants (or their `as_dict`) with the same E, sample time and signal names.  Without ``scheduling``
+        the weights of the vertices are the scheduling parameters, named ``weight1, weight2, ...``.
     plant : mapping, optional
-        Instead: the arguments of `DescriptorSystem`, where entries of all matrices but E may be expressions of the
-        scheduling parameters, such as ``"-k / m"``.
+        The arguments of `DescriptorSystem`, in place of ``vertices``.  Entries of all matrices but E may be expressions
+        of the scheduling parameters, such as ``"-k / m"``.
     scheduling : mapping, optional
         For ``plant``: ``{name: {"range": [low, high], "rate": ..., "column": ..., "unit": ...}}`` or
-        ``{name: [low, high]}``; ``rate`` is the largest change in a second, and ``column`` the column of a log that
-        holds the parameter where it has another name.  For two ``vertices``: one parameter with its range, of which
-        the first vertex is at the low end.
+        ``{name: [low, high]}``.  ``rate`` is the largest change per second, and ``column`` the column of a log with
+        the parameter, if it has another name.  For two ``vertices``: one parameter with its range; the first vertex
+        belongs to the low end.
     constants : mapping of str to float, optional
-        Values of other names in the expressions.
+        Values of the other names in the expressions.
     shift : str, optional
-        A known input that is one in every row, as `linearise` makes one: logs have no column of it.
+        A known input that is one in every row, as in plants of `linearise`: logs have no column for it.
 
     Raises
     ------
@@ -65,9 +64,9 @@ class PolytopicSystem:
 
     Notes
     -----
-    An entry may depend on the parameters as it likes.  Each function of them that does not enter linearly, such as
-    ``v ** 2`` beside ``v``, is a direction of its own, between proved bounds: the polytope then holds more plants than
-    there are, and what is proved for it is proved for these.  Entries are rounded to double precision once.
+    Entries may be any functions of the parameters.  Each nonlinear function, such as ``v ** 2`` beside ``v``, becomes a
+    dimension of the polytope, with proved bounds.  The polytope then contains more plants than the parameters allow,
+    and a proof for the polytope holds for all of these.  Entries are rounded to double precision once.
 
     References
     ----------
@@ -128,7 +127,7 @@ class PolytopicSystem:
         raise AttributeError(f"a PolytopicSystem cannot be changed: {name}")
 
     def __getattr__(self, name: str) -> Any:
-        # What the vertices share is the plant's own: names, sample time, E, and the matrices that do not change.
+        # The plant has the properties that its vertices share: names, sizes, sample time, E.
         if name.startswith("_") or "vertices" not in vars(self):
             raise AttributeError(name)
         first = self.vertices[0]
@@ -144,12 +143,12 @@ class PolytopicSystem:
         return len(self.vertices)
 
     def is_constant(self, *names: str) -> bool:
-        """Whether matrices of these names are the same at all vertices.
+        """Whether the matrices with these names are the same at all vertices.
 
         Parameters
         ----------
         *names : str
-            Such as ``"C"``.
+            Names of matrices, such as ``"C"``.
         """
         first = self.vertices[0]
         return all(
@@ -178,7 +177,7 @@ class PolytopicSystem:
         return self.scheduling.weights(values)
 
     def at(self, parameters: Mapping[str, float] | Sequence[float]) -> DescriptorSystem:
-        """Return the plant at scheduling parameters that stay where they are.
+        """Return the time-invariant plant at constant scheduling parameters.
 
         Parameters
         ----------
@@ -193,12 +192,12 @@ class PolytopicSystem:
         return self.mean(self.weights(parameters))
 
     def mean(self, weights: FloatArray) -> DescriptorSystem:
-        """Return the plant at weights of the vertices.
+        """Return the time-invariant plant at given weights of the vertices.
 
         Parameters
         ----------
         weights : FloatArray
-            ``(N,)``, of the simplex.
+            Weights ``(N,)`` on the simplex.
         """
         changed = {}
         for name in SCHEDULED_MATRICES:
@@ -208,7 +207,7 @@ class PolytopicSystem:
 
     @cached_property
     def center(self) -> DescriptorSystem:
-        """The mean of the vertices, without those that repeat one or lie among the others."""
+        """The mean of the extreme points of the polytope: vertices that repeat or lie between others do not count."""
         spanning = spanning_points(
             [np.concatenate([getattr(each, name).ravel() for name in SCHEDULED_MATRICES]) for each in self.vertices]
         )
@@ -218,7 +217,7 @@ class PolytopicSystem:
         return self.mean(weights)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what it was made of, as the constructor takes it."""
+        """Return the arguments of the constructor that made this plant."""
         return dict(self._given)
 
     @classmethod
@@ -228,7 +227,7 @@ class PolytopicSystem:
         Parameters
         ----------
         data : mapping
-            With ``vertices``, or ``plant``, and ``scheduling``.
+            The arguments of the constructor by name.
         """
         return cls(**data)
 
@@ -245,7 +244,7 @@ class PolytopicSystem:
 def _from_vertices(
     vertices: Sequence[DescriptorSystem], scheduling: Mapping[str, Any] | None
 ) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
-    """Return checked vertices, and their weights as scheduling parameters."""
+    """Return checked vertices, and their scheduling: one stated parameter, or the weights as parameters."""
     if isinstance(vertices, Sequence):
         vertices = [DescriptorSystem(**vertex) if isinstance(vertex, Mapping) else vertex for vertex in vertices]
     if isinstance(vertices, Sequence) and not vertices:
@@ -334,7 +333,8 @@ def _from_expressions(
     written: dict[str, list[tuple[int, int, str]]] = {}
     for name in SCHEDULED_MATRICES:
         arguments[name], written[name] = expressions_in(arguments.get(name))
-    # Each function doubles the vertices: products of sums are expanded where that makes fewer, and loses no parameter.
+    # Each function doubles the number of vertices.  Products of sums are expanded if that makes fewer functions and
+    # keeps all parameters.
     choices = [_forms(written, constants, tuple(parameters), expanded=expanded) for expanded in (False, True)]
     forms, used = min(choices, key=lambda choice: (-len(_names_in(choice[1])), len(choice[1])))
     functions = list(dict.fromkeys([*parameters, *used]))
@@ -359,7 +359,7 @@ def _forms(
     *,
     expanded: bool,
 ) -> tuple[dict[str, list[tuple[int, int, LinearForm]]], list[str]]:
-    """Return the entries of matrices as forms, and the functions that are in them, in their order."""
+    """Return the entries of matrices as linear forms in functions of the parameters, and these functions in order."""
     forms = {
         matrix: [
             (row, column, _form(text, f"{matrix}[{row + 1},{column + 1}]", constants, names, expanded=expanded))
@@ -410,8 +410,7 @@ def _form(
 def _vertex(
     base: DescriptorSystem, forms: Mapping[str, list[tuple[int, int, LinearForm]]], values: Mapping[str, float]
 ) -> DescriptorSystem:
-    """Return the plant at values of the functions, every entry rounded once."""
-
+    """Return the plant at values of the functions, with every entry rounded once."""
     changed = {}
     for name, entries in forms.items():
         if not entries:
@@ -432,7 +431,7 @@ def _vertex(
 
 
 def _plain(value: Any) -> Any:
-    """Return nested lists, numbers and texts of what a plant was made of."""
+    """Return a constructor argument as nested dictionaries, lists, numbers and texts."""
     if isinstance(value, Mapping):
         return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray):

@@ -1,7 +1,8 @@
-"""Stationary covariances whose digits are known: where two ways in double precision disagree, in balls of more digits.
+"""Stationary covariances with known accuracy, by ball arithmetic where two computations in double precision disagree.
 
-With ``X = A X A' + B B'`` and ``P = A^(2^k)``, ``X = S + P X P'``, S the sum of the first 2^k terms: what is left out
-is at most ``|P|^2 |S| / (1 - |P|^2)``.  In continuous time ``(p - A)^-1 (p + A)`` takes the place of A, for any p > 0.
+Let ``X = A X A' + B B'``.  With ``P = A^(2^k)`` and the sum S of the first 2^k terms, ``X = S + P X P'``, so that the
+remainder is at most ``|P|^2 |S| / (1 - |P|^2)``.  In continuous time ``(p - A)^-1 (p + A)`` with any p > 0 takes the
+place of A.
 """
 
 from __future__ import annotations
@@ -16,22 +17,24 @@ from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.spectra import abscissa, noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix, middles
 
-#: Relative difference of two ways of computing a variance up to which double precision is believed.
+#: A variance in double precision is accepted if two computations differ by at most this share.
 SURE_DIFFERENCE = 1e-6
 
-#: With more states nothing is enclosed, and this much is believed.
+#: With more states there is no enclosure, and a difference up to AGREEMENT is accepted.
 MOST_ENCLOSED_STATES, AGREEMENT = 40, 1e-2
 
-#: Digits in bits, tried in turn; doublings, of which each doubles the time; and the radius that is small enough.
+#: Bits of the ball arithmetic, tried in turn, most doublings of the number of terms, and the accepted relative radius.
 TRIED_BITS, MOST_COVARIANCE_DOUBLINGS, RADIUS = (160, 640), 100, 1e-9
 
 
 def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return `noise_covariance` where the trace by observability agrees, else the enclosed one; NaN without either.
+    """Return the covariance of the outputs under unit white noise, or NaN where no computation of it is reliable.
 
-    It is infinite only where a pole lies on or outside the stability boundary, not where rounding blows sums up."""
+    It is `noise_covariance` where the dual computation has the same trace, and the enclosed one otherwise.  It is
+    infinite only where a pole lies on or outside the stability boundary, not where rounding errors grow.
+    """
     covariance = noise_covariance(a, b, c, d, dt)
-    # A variance below zero is rounding as well.
+    # A negative variance, which is a rounding error, fails this comparison as well.
     variance, again = float(np.trace(covariance)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
     if np.isfinite(variance) and abs(variance - again) <= SURE_DIFFERENCE * variance:
         return covariance
@@ -48,10 +51,10 @@ def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Flo
 def enclosed_noise_covariance(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float
 ) -> FloatArray | None:
-    """Return the covariance of the stored numbers, of which nine digits are proved; ``None`` where they are not."""
+    """Return the covariance to nine proved digits; ``None`` where these cannot be proved."""
     if not 0 < len(a) <= MOST_ENCLOSED_STATES or not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
         return None
-    # States of like size need fewer digits; powers of two change none of the numbers.
+    # Balanced states need fewer bits; the factors are powers of two, so that no number is rounded.
     a, b, c = balanced_realisation(a, b, c)
     for bits in TRIED_BITS:
         with flint.ctx.workprec(bits):
@@ -72,8 +75,11 @@ def enclosed_noise_covariance(
 
 
 def enclosed_sum(a: Any, weight: Any, size: float, *, discrete: bool) -> Any | None:
-    """Return X with ``X = a X a' + weight`` (``a X + X a' + weight = 0``) of ``flint.arb_mat`` as balls; ``None`` where
-    powers do not decay.  ``size``: of a, any positive number will do."""
+    """Return balls that contain X with ``X = a X a' + weight``, in continuous time ``a X + X a' + weight = 0``.
+
+    ``a`` and ``weight`` are `flint.arb_mat`.  ``size`` is the p of the transformation in continuous time, best near the
+    size of ``a``.  ``None`` where the powers of ``a`` do not decay.
+    """
     n = a.nrows()
     states, power = weight, a
     if not discrete:
@@ -96,5 +102,5 @@ def enclosed_sum(a: Any, weight: Any, size: float, *, discrete: bool) -> Any | N
 
 
 def squared_norm(matrix: Any) -> Any:
-    """Return the squared Frobenius norm, as a ball."""
+    """Return a ball that contains the squared Frobenius norm."""
     return sum((value * value for value in matrix.entries()), flint.arb(0))

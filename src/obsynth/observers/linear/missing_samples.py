@@ -1,4 +1,4 @@
-"""Missing samples of a linear observer: the plant's model replaces the sensors, until its effect has decayed."""
+"""Missing samples of a linear observer: predictions of the plant's model replace the measurements in a gap."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from obsynth.observers.linear.modes import noise_variances
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: How many lengths of an interval are kept discretised.
+#: Number of interval lengths whose discretised model is cached.
 KEPT_INTERVALS = 64
 
-#: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
-#: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
+#: A gap counts as over when its possible error in fault estimates and residuals has decayed below this share of their
+#: usual change from row to row, measured over at least LEAST_SHOWN rows, or below their deviation by sensor noise.
 GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 
 
 class GapModel:
-    """The plant model that stands in for the sensors during a gap: faults held, unknown inputs zero, ``E = I``.
-    ``into (nx, nx_source)``: the dynamic states in an estimate of all states."""
+    """The plant model that predicts the measurements in a gap, with faults held and unknown inputs zero.
+
+    The plant has ``E = I``.  ``into (nx, nx_source)`` maps an estimate of all states to its dynamic states.
+    """
 
     def __init__(self, plant: DescriptorSystem, into: FloatArray) -> None:
         self.plant, self.into = plant, into
@@ -38,14 +40,15 @@ class GapModel:
         from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 
         try:
-            done = eliminate_algebraic_states(plant)
+            eliminated = eliminate_algebraic_states(plant)
         except PreconditionError:
             return None
-        moving = plant.E @ done.recovery.from_state
-        return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
+        # E x depends on the dynamic states alone: solve E x = (E R) z for z.
+        dynamic = plant.E @ eliminated.recovery.from_state
+        return cls(eliminated.plant, np.asarray(np.linalg.pinv(dynamic) @ plant.E))
 
     def start(self, estimate: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
-        """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
+        """Return the present dynamic states from an older estimate ``(nx_source,)`` and the inputs since."""
         state = self.into @ estimate
         for u in inputs:
             state = self.after(state, 0.0, u, u, fault)
@@ -54,7 +57,7 @@ class GapModel:
     def after(
         self, state: FloatArray, seconds: float, before: FloatArray, u: FloatArray, fault: FloatArray
     ) -> FloatArray:
-        """Return the state a sample later, or after an interval along which inputs go from ``before`` to ``u``."""
+        """Return the state one sample later, or after an interval in which inputs change linearly to ``u``."""
         plant = self.plant
         if plant.dt > 0.0:
             return np.asarray(plant.A @ state + plant.B @ before + plant.Bf @ fault)
@@ -77,24 +80,27 @@ class GapModel:
 
 
 class MissingSamples:
-    """What a linear observer of a plant goes by where samples are missing; ``solver (nx, nz + ny)`` gives the states of
-    an observer that does not estimate all of them, where there is one."""
+    """What a run of a linear observer needs in order to bridge missing samples: model, delays, and noise.
+
+    ``solver (nx, nz + ny)`` recovers all states of the plant from the observer's state and the outputs, for an
+    observer that does not estimate all of them; ``None`` where there is no such matrix.
+    """
 
     def __init__(self, plant: DescriptorSystem, observer: LinearObserver, solver: FloatArray | None) -> None:
         self.plant, self.observer, self.solver = plant, observer, solver
         lags = set(observer.state_delays) or {0}
-        #: Inputs from the moment on of which the estimates are.
+        #: Number of last inputs that are kept: from the sample of the delayed estimate on.
         self.kept_inputs = max(lags) + 1
         gives_states = estimates_all_states(plant, observer) or solver is not None
         self.model = None if len(lags) > 1 or not gives_states else GapModel.of(plant)
-        #: Numbers of the plant's faults that are estimated; the others are held to be absent.
+        #: Indexes of the plant's faults that are estimated; the model has the other ones at zero.
         self.estimated_faults = [plant.fault_names.index(name) for name in observer.fault_names]
-        #: How many states are known at a measured row, from which the model starts.
+        #: Number of states at a measured row from which the model starts.
         self.known_states = len(observer.state_names) if solver is None else plant.nx
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Variances that the stated noise of the sensors gives fault estimates and residuals, zero if not known."""
+        """Variances of fault estimates and residuals by the stated sensor noise; zero where they are not known."""
         observer, compared = self.observer, slice(len(self.observer.state_names), None)
         if observer.dt > 0.0 and observer.By.shape[1] == self.plant.ny:
             return noise_variances(observer, self.plant.Dw)[compared]

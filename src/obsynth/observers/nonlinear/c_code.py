@@ -26,7 +26,7 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
-from obsynth.observers.nonlinear.settings import initial_memory
+from obsynth.observers.nonlinear.layouts import initial_memory
 from obsynth.observers.nonlinear.step_graph import ObserverGraph
 from obsynth.observers.nonlinear.steps import Steps
 from obsynth.observers.outliers import COMPARABLE, FAR_OUT, LONGEST_LEFT_OUT, NO_SQUARE, RESET_WINDOW, chi_square_limit

@@ -1,7 +1,7 @@
-"""The eleven steps of each sample as one CasADi graph, the only place where they are written.
+"""The eleven steps of a DAE observer at each sample, as one CasADi graph that Python, C and checks share.
 
-The order makes (12)-(23) explicit: prediction and its covariance with K, H and L of k - 1; the innovation before any
-update; the parameters; the state that follows them; H, L and K at the result.
+In this order (12)-(23) are explicit: the prediction and its covariance with K, H and L of k - 1; the innovation before
+any update; the parameters; the state that follows from them; then H, L and K at the new estimate.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy as np
 
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.graph_equations import definite_solved
-from obsynth.observers.nonlinear.settings import DAESettings, Layout, memory_layout, row_layout
+from obsynth.observers.nonlinear.layouts import Layout, memory_layout, row_layout
+from obsynth.observers.nonlinear.settings import DAESettings
 from obsynth.plants.dae_functions import DAEFunctions
 from obsynth.plants.implicit_step import StepGraph, input_effect, step_graph
 
@@ -23,23 +24,43 @@ Arrays = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class ObserverGraph:
-    """The functions of an observer."""
+    """The CasADi functions of an observer.
+
+    Parameters
+    ----------
+    settings : DAESettings
+        The observer's fields.
+    memory, row : Layout
+        The arrays that are carried to the next sample, and the further results of a sample.
+    functions : DAEFunctions
+        The model with its method of integration.
+    step : StepGraph
+        The implicit step of the model.
+    first : casadi.Function
+        The sample k = 0: ``(memory, y, seen)`` to memory and row, where ``seen`` is 1 for each received output.
+    sample : casadi.Function
+        A later sample after a solved step: ``(memory, stages, u, y, seen, missing)`` to memory and row, where
+        ``missing`` is the covariance of `unknown`.
+    whole : casadi.Function
+        The implicit step and `sample` in one: ``(memory, [u; y; seen])`` to memory and row.
+    """
 
     settings: DAESettings
-    memory: Layout  # memory, row: of what is carried on, and of what is said besides
+    memory: Layout
     row: Layout
-    functions: DAEFunctions  # the model with its method of integration
-    step: StepGraph  # its implicit step
-    first: Any  # from memory, outputs and one for each that is seen, at k = 0, to memory and row
-    # from memory, stages of the solved step, input, outputs, what is seen, and what `unknown` says, to memory and row
+    functions: DAEFunctions
+    step: StepGraph
+    first: Any
     sample: Any
-    whole: Any  # the implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row
-    _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
+    whole: Any
+    _repeated: dict[int, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def unknown(self) -> Any:
-        """From memory, stages, inputs and variances of these to what missing inputs add to the covariance; `None`
-        without inputs."""
+        """Function of memory, stages, inputs and their variances: the covariance of the state by missing inputs.
+
+        `None` for a model without inputs.
+        """
         if not self.settings.model.nu:
             return None
         effect = input_effect(self.functions, self.settings.dt)
@@ -51,9 +72,9 @@ class ObserverGraph:
 
     @cached_property
     def forecast(self) -> Any:
-        """From memory and row of a sample that nothing was seen of to mean and covariance of its outputs."""
-        packed, said = ca.MX.sym("memory", self.memory.size), ca.MX.sym("said", self.row.size)
-        arrays = {**self.memory.symbols(packed), **self.row.symbols(said)}
+        """Function of memory and row of a sample without measurements: mean and covariance of its outputs."""
+        packed, result = ca.MX.sym("memory", self.memory.size), ca.MX.sym("row", self.row.size)
+        arrays = {**self.memory.symbols(packed), **self.row.symbols(result)}
         spread = arrays["spread"]
         y, H, L = self.functions.output_function(arrays["posterior"], arrays["theta"])
         cross = arrays["cross"] if self.settings.form == "augmented-kalman" else arrays["Upsilon"] @ spread
@@ -61,17 +82,17 @@ class ObserverGraph:
         covariance = (
             H @ arrays["covariance"] @ H.T + through_both + through_both.T + L @ spread @ L.T + ca.DM(self.settings.R)
         )
-        return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(covariance)])
+        return ca.Function("forecast", [packed, result], [ca.densify(y), ca.densify(covariance)])
 
     def over(self, samples: int) -> Any:
-        """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
-        if samples not in self._stretches:
-            self._stretches[samples] = self.whole.mapaccum(samples)
-        return self._stretches[samples]
+        """Return `whole` over several samples: a function of memory and columns ``[u; y; seen]``, one a sample."""
+        if samples not in self._repeated:
+            self._repeated[samples] = self.whole.mapaccum(samples)
+        return self._repeated[samples]
 
 
 def observer_graph(observer: DAESettings) -> ObserverGraph:
-    """Return the functions of an observer."""
+    """Return the CasADi functions of an observer."""
     functions = DAEFunctions(observer.model, observer.integration)
     step = step_graph(functions, observer.dt, np.inf if observer.largest_move is None else observer.largest_move)
     memory, row = memory_layout(observer), row_layout(observer)
@@ -79,15 +100,15 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     packed, X = ca.MX.sym("memory", memory.size), ca.MX.sym("stages", nx * functions.stages)
     u, y, seen = ca.MX.sym("u", nu), ca.MX.sym("y", ny), ca.MX.sym("seen", ny)
     missing = ca.MX.sym("missing", nx, nx)
-    nothing = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
-    begun = {**nothing, **memory.symbols(packed)}
+    empty_row = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
+    start = {**empty_row, **memory.symbols(packed)}
     first = ca.Function(
-        "first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(begun), memory, row)
+        "first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(start), memory, row)
     )
     before = memory.symbols(packed)
     local = step.sensitivities(X, before["posterior"], u, before["theta"])
     predicted = _predicted(observer, before, X[-nx:], local, missing)
-    updated = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
+    updated = {**empty_row, **_Update(observer, functions, y, seen).later(predicted)}
     sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(updated, memory, row))
     if step.small:
         first, sample = first.expand(), sample.expand()
@@ -95,19 +116,20 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     u, y, seen = arriving[:nu], arriving[nu : nu + ny], arriving[nu + ny :]
     before = memory.symbols(packed)
     stages, residual, trusted = step.step(before["posterior"], u, before["theta"])
-    after, said = sample(packed, stages, u, y, seen, ca.DM.zeros(nx, nx))
-    # The residual and the verdict are the last two entries of a row.
-    said = ca.vertcat(said[: row.size - 2], residual, trusted)
-    whole = ca.Function("whole", [packed, arriving], [after, said])
+    after, result = sample(packed, stages, u, y, seen, ca.DM.zeros(nx, nx))
+    # The last two entries of a row are the residual of the step and whether it is trusted.
+    result = ca.vertcat(result[: row.size - 2], residual, trusted)
+    whole = ca.Function("whole", [packed, arriving], [after, result])
     return ObserverGraph(observer, memory, row, functions, step, first, sample, whole)
 
 
 def _outcome(arrays: Arrays, memory: Layout, row: Layout) -> list[Any]:
+    """Return the vectors of memory and row."""
     return [memory.column(arrays), row.column(arrays)]
 
 
 def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...], missing: Any) -> Arrays:
-    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1, and what missing inputs add."""
+    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1; ``missing``: covariance by inputs."""
     F, G, noise, scaled = local
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
     added = noise @ ca.DM(observer.Q) @ noise.T + missing
@@ -116,7 +138,7 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
              "scaled": scaled}  # fmt: skip
     carried = F @ (error_map @ before["Upsilon"] - K @ L)
     if observer.form != "forgetting":
-        # The parameters of a sample act in the step that leads there: they have walked already.
+        # The step to a sample uses the parameters of that sample, so the random walk comes before the prediction.
         after["spread"] = walked = spread + ca.DM(observer.random_walk)
     if observer.form == "augmented-kalman":
         through = F @ before["cross"] @ G.T
@@ -125,8 +147,8 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
     else:
         P = F @ (error_map @ P @ error_map.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
     if observer.form == "random-walk" and observer.random_walk.any():
-        # What was learnt holds for the parameters before their walk: a share of it holds for those after, and what
-        # that leaves open is noise of the state alone (Hsieh and Chen 1999), so that both stay uncorrelated.
+        # The state depends on the parameters before their walk.  A share of this dependence is one on the parameters
+        # after it, and the rest is noise of the state alone, so that both stay uncorrelated (Hsieh and Chen 1999).
         kept_share = definite_solved(walked, spread).T
         remaining_spread = spread - kept_share @ spread
         P, carried = P + carried @ (0.5 * (remaining_spread + remaining_spread.T)) @ carried.T, carried @ kept_share
@@ -137,35 +159,37 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
 
 
 class _Update:
-    """The measurement of one sample; a channel that is not seen has an innovation of zero and no gain."""
+    """The measurement update of one sample; a missing output has an innovation of zero and no gain."""
 
     def __init__(self, observer: DAESettings, functions: DAEFunctions, y: Any, seen: Any) -> None:
         self.observer, self.functions, self.y, self.seen = observer, functions, y, seen
-        # The rows and columns of R that are not seen become those of the identity, which nothing else touches.
+        # Rows and columns of R for missing outputs become those of the identity, so that R stays invertible.
         self.R = ca.DM(observer.R) * (seen @ seen.T) + ca.diag(1.0 - seen)
 
     def first(self, predicted: Arrays) -> Arrays:
-        """Correct the state only: y(0) says nothing of the parameters that the start does not."""
+        """Return the update at k = 0, of the state only: y(0) has no information on the parameters yet."""
         innovation = self._innovation(predicted)
-        return self._joint(innovation, learns=False) if self._is_joint else self._corrected(innovation)
+        return self._joint(innovation, learns=False) if self._is_joint else self._state_update(innovation)
 
     def later(self, predicted: Arrays) -> Arrays:
-        """Update parameters and state."""
+        """Return the update of parameters and state."""
         innovation = self._innovation(predicted)
-        return self._joint(innovation, learns=True) if self._is_joint else self._corrected(self._learnt(innovation))
+        if self._is_joint:
+            return self._joint(innovation, learns=True)
+        return self._state_update(self._parameter_update(innovation))
 
     @property
     def _is_joint(self) -> bool:
         return self.observer.form == "augmented-kalman"
 
     def _received_outputs(self, arrays: Arrays) -> tuple[Any, Any, Any, Any, Any]:
-        """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
+        """Return H and L, then innovation, H and L with zeros for the missing outputs."""
         predicted, H, L = self.functions.output_function(arrays["x"], arrays["theta"])
         mask = ca.diag(self.seen)
         return H, L, self.seen * (self.y - predicted), mask @ H, mask @ L
 
     def _innovation(self, arrays: Arrays) -> Arrays:
-        """Step 6, with the square of the innovation in units of its covariance and what it says of the parameters."""
+        """Step 6: the innovation, its covariance and normalised square, and its information on the parameters."""
         _, _, e, H, L = self._received_outputs(arrays)
         Sigma = H @ arrays["P"] @ H.T + self.R
         Omega = H @ arrays["Upsilon"] + L
@@ -187,10 +211,10 @@ class _Update:
             "seen L": L,
         }
 
-    def _learnt(self, arrays: Arrays) -> Arrays:
-        """Steps 7 to 9 and 11: (17)-(19); a sample without a measurement changes nothing."""
+    def _parameter_update(self, arrays: Arrays) -> Arrays:
+        """Steps 7 to 9 and 11: (17)-(19); a sample without any measurement changes nothing."""
         observer, Sigma, Omega = self.observer, arrays["Sigma"], arrays["Omega"]
-        prior, spread = self._remembered(arrays["S"]), arrays["spread"]
+        prior, spread = self._prior(arrays["S"]), arrays["spread"]
         weight = self.R if observer.weight == "paper" else Sigma
         gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
         S = prior - gain @ Omega @ prior
@@ -206,8 +230,11 @@ class _Update:
         anything = ca.sum1(self.seen) > 0.0
         return {**arrays, **{name: ca.if_else(anything, value, arrays[name]) for name, value in after.items()}}
 
-    def _remembered(self, S: Any) -> Any:
-        """Return S / lambda, or S that has walked, or what is left of the information beside that of S_0."""
+    def _prior(self, S: Any) -> Any:
+        """Return S before the measurement: S / lambda, or S itself where the prediction has added the random walk.
+
+        With the guard, forgetting replaces lost information by a share of the initial one, so that S stays bounded.
+        """
         observer = self.observer
         if observer.form == "random-walk":
             return S
@@ -226,7 +253,7 @@ class _Update:
             entries[i] = ca.fmin(entries[i], high) if np.isfinite(high) else entries[i]
         return ca.vertcat(*entries) if entries else theta
 
-    def _corrected(self, arrays: Arrays) -> Arrays:
+    def _state_update(self, arrays: Arrays) -> Arrays:
         """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
         full_H, full_L, e, H, _ = self._received_outputs(arrays)
         P = arrays["P"]

@@ -13,7 +13,8 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, all_finite, read_only
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.nonlinear.estimates import DAERow
-from obsynth.observers.nonlinear.settings import DAESettings, initial_memory
+from obsynth.observers.nonlinear.layouts import initial_memory
+from obsynth.observers.nonlinear.settings import DAESettings
 from obsynth.observers.nonlinear.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.observers.taken_inputs import TakenInputs, held_inputs, no_inputs, over_samples, taken_inputs

@@ -1,18 +1,18 @@
-r"""Scheduled observers: linear ones whose matrices are means, with weights from measured parameters, of vertices.
+r"""Scheduled observers: linear observers whose matrices are weighted means of vertices, by measured parameters.
 
 .. math::
     z^+ = A_z(\mu_k) z + B_u(\mu_k) u + B_y(\mu_k) y, \qquad
     [\hat x; \varphi; r] = C_z z + D_u u + D_y y, \qquad \hat f = \Delta(\mu_{k-1})^{-1} \varphi
 
-with the weights of the sample itself, but for the effectiveness :math:`\Delta` of the faults and a correction
-:math:`K(\mu_{k-1}) r` of z: both belong to the parameters of the sample before.  In continuous time (``dt = 0``) a row
-is taken by a step of implicit Euler over the h seconds since the one before,
+with the weights :math:`\mu_k` of the sample itself.  Only the effectiveness :math:`\Delta` of the faults and a
+correction :math:`K(\mu_{k-1}) r` of z have the weights of the sample before.  In continuous time (``dt = 0``) each
+sample takes a step of implicit Euler over the h seconds since the last one,
 
 .. math::
     z_k = (I - h A_z(\mu_k))^{-1} (z_{k-1} + h B_u(\mu_k) u_k + h B_y(\mu_k) y_k),
 
-and errors that decay like :math:`e^{-a t}` in the norm of a matrix P for every course of the parameters shrink in it by
-:math:`(1 + 2 a h)^{-1/2}`, however long the step is.
+If errors decay like :math:`e^{-a t}` in the norm of a matrix P for all parameter trajectories, then this step shrinks
+them by :math:`(1 + 2 a h)^{-1/2}` in that norm, for any h.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from obsynth.observers.running import Observer
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.scheduling import RATE_TOLERANCE, Scheduling
 
-#: The matrices that have a value at each vertex; of the others there is one.
+#: Matrices with a value at each vertex, and matrices that are the same at all vertices.
 SCHEDULED = ("Az", "Bu", "By")
 FIXED = ("Cz", "Du", "Dy")
-#: How much of an error is left when a row counts as claimed again.
+#: Claims hold again when an error has decayed to this share.
 FORGOTTEN_SHARE = 0.01
 
 
@@ -47,42 +47,43 @@ class ScheduledState(NamedTuple):
     """The state of a scheduled observer."""
 
     z: FloatArray  # ``(nz,)``, before the next sample
-    weights: FloatArray  # ``(N,)``, of the sample before
-    parameters: FloatArray  # ``(p,)``, of the sample before, within their ranges; NaN before the first
-    unclaimed: float  # rows (continuous time: seconds) for which nothing is claimed yet
+    weights: FloatArray  # ``(N,)``, at the last sample
+    parameters: FloatArray  # ``(p,)``, at the last sample, within their ranges; NaN before the first sample
+    unclaimed: float  # rows, or in continuous time seconds, until claims hold again
 
 
 @dataclass(frozen=True, eq=False)
 class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
-    """An observer whose matrices change with measured parameters, which are read after the known inputs.
+    """An observer whose matrices change with measured parameters; ``u`` holds them after the known inputs.
 
-    A missing parameter keeps its last value, and one outside its range is moved to the nearest end: from then on, until
-    the error has decayed again, nothing is claimed.
+    A missing parameter keeps its last value, and one outside its range is replaced by the nearest end.  Claims do not
+    hold from then on until the error has decayed.
 
     Parameters
     ----------
     Az, Bu, By : FloatArray
-        ``(N, nz, nz)``, ``(N, nz, nu)``, ``(N, nz, ny)``: at each vertex.
+        Matrices of z at each vertex: ``(N, nz, nz)``, ``(N, nz, nu)``, ``(N, nz, ny)``.
     Cz, Du, Dy : FloatArray
-        ``(nx + nf + nr, nz)``, ``(nx + nf + nr, nu)``, ``(nx + nf + nr, ny)``: states, faults, residuals.
+        Rows of states, faults and residuals: ``(nx + nf + nr, nz)``, ``(nx + nf + nr, nu)``, ``(nx + nf + nr, ny)``.
     effectiveness : FloatArray
-        ``(N, nf, nf)``: what the fault rows are divided by, with the weights of the sample before.
+        Matrices at each vertex ``(N, nf, nf)``: their mean, with the weights of the sample before, divides the rows of
+        faults.
     scheduling : Scheduling
-        Parameters, ranges, and the weights that follow from them.
+        The parameters, their ranges, and how weights follow from them.
     forgetting : int or float
-        For how long nothing is claimed after a parameter was missing or outside its range: rows, or in continuous time
-        seconds.
+        How long claims do not hold after a parameter was missing or outside its range, in rows, or in seconds for
+        continuous time.
     dt : float
         Seconds between samples; 0 in continuous time.
     input_names : tuple of str
-        Known inputs, then scheduling parameters (the columns that hold them).
+        Known inputs, then the columns of the scheduling parameters.
     output_names, state_names, fault_names, residual_names : tuple of str
         The signals of ``y`` and of the rows, in order.
     state_delays, fault_delays : tuple of int
-        Samples by which each estimate lags.
+        Delay of each estimate in samples.
     correction : FloatArray, optional
-        ``(N, nz, nr)``: what the residuals of a sample correct z by, with the weights of the sample before; in discrete
-        time.  None by default.
+        Gains ``(N, nz, nr)`` from the residuals of a sample to a correction of z, with the weights of the sample
+        before; in discrete time only.
 
     Raises
     ------
@@ -128,12 +129,12 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
 
     @staticmethod
     def names_of(plant: PolytopicSystem) -> dict[str, Any]:
-        """Return the fields that an observer of all states has from its plant: sample time, scheduling and names.
+        """Return the fields that an observer of all states takes from its plant: sample time, scheduling and names.
 
         Parameters
         ----------
         plant : PolytopicSystem
-            Its scheduling parameters are read after its known inputs.
+            The plant that the observer is for.
         """
         return {
             "scheduling": plant.scheduling,
@@ -212,11 +213,11 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
 
     @cached_property
     def effectiveness_is_one(self) -> bool:
-        """Whether fault rows are divided by nothing."""
+        """Whether the effectiveness is the identity at all vertices, so that the rows of faults stay as they are."""
         return not self.fault_names or not bool((self.effectiveness != np.eye(len(self.fault_names))).any())
 
     def at_vertex(self, place: int) -> LinearObserver:
-        """Return the linear observer that it is while the weight of one vertex is one.
+        """Return the linear observer at a vertex.
 
         Parameters
         ----------
@@ -230,7 +231,7 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         return self._linear(place, Cz, Du, Dy)
 
     def before_division(self, place: int) -> LinearObserver:
-        """Return the linear observer at a vertex whose fault rows are not divided by the effectiveness.
+        """Return the linear observer at a vertex without the division of the fault rows by the effectiveness.
 
         Parameters
         ----------
@@ -271,21 +272,21 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
 
     @cached_property
     def middle(self) -> FloatArray:
-        """The middle of the region: where parameters are taken to be before the first one is known."""
+        """The middle of the region, which replaces parameters before their first value."""
         return 0.5 * (self.scheduling.low + self.scheduling.high)
 
     @cached_property
     def steps(self) -> FloatArray:
-        """How far parameters may move within a sample; infinite where no rate is stated."""
+        """Largest change of each parameter within a sample; infinite where no rate is stated."""
         return self.steps_in(self.dt)
 
     def steps_in(self, seconds: float) -> FloatArray:
-        """Return how far parameters ``(p,)`` may move in some seconds; infinite where no rate is stated.
+        """Return the largest change of each parameter ``(p,)`` in a time; infinite where no rate is stated.
 
         Parameters
         ----------
         seconds : float
-            Above 0.
+            The time, positive.
         """
         rates = [np.inf if rate is None else rate for rate in self.scheduling.rates]
         return np.array(rates) * seconds * (1.0 + RATE_TOLERANCE)
@@ -300,20 +301,20 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         state : ScheduledState
             Before the sample.
         y, u : FloatArray
-            ``(ny,)`` and ``(nu + p,)``: known inputs, then parameters, of which NaN is a missing one.
+            ``(ny,)`` and ``(nu + p,)``: known inputs, then parameters, NaN for a missing one.
         seconds : float, optional
-            In continuous time how long ago the sample before was; 0 for the first.
+            In continuous time the time since the last sample; 0 for the first.
         """
         if self.dt == 0.0:
-            return self._moved(state, y, u, seconds)
+            return self._advance_continuous(state, y, u, seconds)
         inputs, measured = u[: self.inputs], u[self.inputs :]
         parameters = self._parameters(state, measured)
         weights = self.scheduling.weights(parameters)
         row, z = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y, state.z
         if self.correction is not None:
-            moved = np.tensordot(state.weights, self.correction, 1) @ row[self.residual_rows]
-            row[self.state_rows] += self.Cz[self.state_rows] @ moved
-            z = z + moved
+            change = np.tensordot(state.weights, self.correction, 1) @ row[self.residual_rows]
+            row[self.state_rows] += self.Cz[self.state_rows] @ change
+            z = z + change
         if not self.effectiveness_is_one:
             effect = np.tensordot(state.weights, self.effectiveness, 1)
             row[self.fault_rows] = np.linalg.solve(effect, row[self.fault_rows])
@@ -321,18 +322,18 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         for weight, Az, Bu, By in zip(weights, self.Az, self.Bu, self.By, strict=True):
             if weight:
                 after += weight * (Az @ z + Bu @ inputs + By @ y)
-        # Before the first sample nothing moved: that comparison with NaN is false.
+        # Before the first sample `state.parameters` are NaN, so that no comparison is true.
         slow = not bool((np.abs(measured - state.parameters) > self.steps).any())
         inside = slow and self.scheduling.is_inside(measured)
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         return ScheduledState(after, weights, parameters, unclaimed), row
 
     def _parameters(self, state: ScheduledState, measured: FloatArray) -> FloatArray:
-        """Return the parameters of a sample: a missing one as it last was, one outside its range at the nearest end."""
+        """Return the parameters of a sample: the last value for a missing one, the nearest end outside the range."""
         before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
         return np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
 
-    def _moved(
+    def _advance_continuous(
         self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float
     ) -> tuple[ScheduledState, FloatArray]:
         """Return the state after a step of implicit Euler in continuous time, and the row at its end."""
@@ -350,25 +351,27 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         return ScheduledState(z, weights, parameters, unclaimed), row
 
     def rows_without_claim(self, seconds: float) -> int:
-        """Return the rows, each so long after the one before, until a hundredth of an error is left.
+        """Return the number of rows without a claim after a parameter was missing or outside its range.
 
         Parameters
         ----------
         seconds : float
-            Between rows; for continuous time.
+            Time between rows, for a continuous observer.
         """
         if self.dt > 0.0 or not self.forgetting:
             return int(self.forgetting)
         return int(np.ceil(self.forgetting / self.forgotten_in(seconds)))
 
     def forgotten_in(self, seconds: float) -> float:
-        """Return by how much a row brings the end of `forgetting` nearer: 1 in discrete time, else the seconds of the
-        exact observer in which an error shrinks as it does in one step of implicit Euler.
+        """Return the part of `forgetting` that one row takes off.
+
+        That is 1 in discrete time.  In continuous time it is the time in which the exact observer shrinks an error as
+        much as one step of implicit Euler does.
 
         Parameters
         ----------
         seconds : float
-            Since the row before.
+            Time since the last row.
         """
         if self.dt > 0.0:
             return 1.0
@@ -391,13 +394,13 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         u : array_like
             Known inputs, then scheduling parameters, ``(nu + p,)``; NaN marks a missing parameter.
         seconds : float, optional
-            In continuous time how long ago the sample before was; 0 for the first.
+            In continuous time the time since the last sample; 0 for the first.
 
         Raises
         ------
         SpecError
-            A sample has the wrong length, or something but a parameter is not finite; in continuous time ``seconds``
-            are missing, in discrete time they are given.
+            A sample has the wrong length, or a value other than a parameter is not finite; ``seconds`` is missing in
+            continuous time, or given in discrete time.
         """
         elapsed = self._elapsed(seconds, "seconds")
         require_kind(state, ScheduledState, "state", "what init() or the step before returned")
@@ -444,7 +447,7 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     def record(
         self, y: ArrayLike, u: ArrayLike, *, sample_time: float | None = None
     ) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return the rows of a record ``(samples, nx + nf + nr)``, and at which of them something is claimed.
+        """Return the rows of a record ``(samples, nx + nf + nr)``, and for each of them whether claims hold.
 
         Parameters
         ----------
