@@ -10,7 +10,7 @@ import pytest
 
 from obsynth.exporting.float_error import UNIT, float_bounds
 from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 
 
 def one_state(pole: float, *, into: float, rise: float = 0.0) -> SimpleNamespace:

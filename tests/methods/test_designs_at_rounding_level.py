@@ -11,7 +11,7 @@ from benchmarks.campaigns.static_and_chains import plant_of
 import obsynth
 from obsynth import DescriptorSystem, PreconditionError, VerificationError, ui_pi_observer
 from obsynth.methods.rounding import last_digits, require_above_rounding
-from obsynth.proofs.exact_arithmetic import stored_matrix
+from obsynth.proofs.exact_doubles import stored_matrix
 
 PLANT = DescriptorSystem(None, [[-1.0, 0.5], [0.0, -2.0]], C=np.eye(2), Bf=[[1], [0]])
 

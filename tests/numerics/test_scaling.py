@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from obsynth.numerics import logarithmic_balance
 from obsynth.numerics.logarithmic_balance import LogBalance, _whole_parts
 from obsynth.numerics.scaling import balance_system, equilibrate_pencil, power_of_two_below
-from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
+from obsynth.proofs.exact_doubles import stored_matrix
+from obsynth.proofs.rational_matrices import nearest_doubles
 
 PAPER_E = np.diag([1.0, 1.0, 1.0, 0.0])
 PAPER_A = np.array([[0.9, 0.005, -0.095, 0], [0.005, 0.995, 0.0997, 0], [0.095, -0.0997, 0.99, 0], [1, 0, 1, 1]])

@@ -8,21 +8,17 @@ import pytest
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly
 
 from obsynth.proofs import exact_pencils as exact_arithmetic
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import is_computed, whole_matrices, written_fraction, written_matrix
+from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.polynomial_roots import locate_roots, primitive
+from obsynth.proofs.rational_matrices import (
     blocks,
-    is_computed,
-    locate_roots,
     nearest_doubles,
     null_basis,
     pivot_columns,
-    primitive,
     rank_of,
-    whole_matrices,
     whole_null_basis,
-    written_fraction,
-    written_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil
 
 
 def mixed(E, A, seed):

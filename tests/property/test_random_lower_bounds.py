@@ -8,7 +8,7 @@ from obsynth.analysis.existence.restricted_equivalent import prepare
 from obsynth.conditions.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem
 from obsynth.numerics.central_filter import search_least_gain
-from obsynth.proofs.exact_arithmetic import stored_matrix
+from obsynth.proofs.exact_doubles import stored_matrix
 from obsynth.verification.least_gain_proof import ALONE, LAST, LEAST_GAIN_PAIRS, InvisiblePairs
 
 

@@ -25,7 +25,7 @@ from obsynth.numerics.output_nulling import (
     strict_point,
 )
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import nearest_doubles
+from obsynth.proofs.rational_matrices import nearest_doubles
 from obsynth.verification.least_gain_proof import (
     ALONE,
     LAST,

@@ -17,7 +17,7 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 from obsynth.proofs.witnesses import (
     Dyadic,
     blocks,

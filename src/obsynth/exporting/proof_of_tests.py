@@ -18,7 +18,7 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 from obsynth.proofs.nearby_solutions import independent_part, solved_by_lifting
 from obsynth.proofs.witnesses import Dyadic, number_data, root_above, written
 from obsynth.results.design import ObserverDesign

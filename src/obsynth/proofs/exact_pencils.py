@@ -21,18 +21,9 @@ import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.exact_arithmetic import (
-    PRIME,
-    Root,
-    blocks,
-    coprime,
-    identity,
-    locate_roots,
-    over_one_denominator,
-    primitive,
-    written_matrix,
-    zeros_matrix,
-)
+from obsynth.proofs.exact_doubles import written_matrix
+from obsynth.proofs.polynomial_roots import Root, locate_roots, primitive
+from obsynth.proofs.rational_matrices import PRIME, blocks, coprime, identity, over_one_denominator, zeros_matrix
 
 #: Primes for ranks that are only bounded from below.
 _PRIMES = (PRIME, 2305843009213693921, 2305843009213693907)

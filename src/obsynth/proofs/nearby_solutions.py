@@ -19,7 +19,7 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 
 #: Diagonal of the pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
 DEPENDENT_ROW = 1e-13

@@ -19,7 +19,7 @@ import numpy as np
 from flint import arb, arb_mat, fmpz, fmpz_mat
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 
 #: Bits that are tried: few where the inequality has room, many for poles near to each other or to the boundary.
 PRECISIONS = (160, 320, 640, 1280)

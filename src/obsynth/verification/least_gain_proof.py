@@ -26,18 +26,17 @@ from obsynth.numerics.outward import lower_text
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import squared_norm
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import stored_matrix, whole_matrices
+from obsynth.proofs.extended_balls import arb_matrix, undecided_pivot
+from obsynth.proofs.rational_matrices import (
     blocks,
     null_basis,
     picked_columns,
     picked_rows,
     row_basis,
-    stored_matrix,
-    whole_matrices,
     whole_null_basis,
     zeros_matrix,
 )
-from obsynth.proofs.extended_balls import arb_matrix, undecided_pivot
 from obsynth.results.checks import Check, information
 
 #: Filters of more states are not examined: exact null spaces of that many doubles take seconds.

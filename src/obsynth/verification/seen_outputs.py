@@ -11,7 +11,7 @@ import scipy.linalg
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import stored_matrix
+from obsynth.proofs.exact_doubles import stored_matrix
 from obsynth.verification.worst_invisible import Model
 
 

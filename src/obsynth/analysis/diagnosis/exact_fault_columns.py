@@ -17,20 +17,17 @@ from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal, re
 from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import (
-    Root,
+from obsynth.proofs.exact_doubles import holds_computed, written_fraction
+from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.polynomial_roots import Root, locate_roots, primitive
+from obsynth.proofs.rational_matrices import (
     blocks,
-    holds_computed,
     identity,
     left_null_basis,
-    locate_roots,
     picked_columns,
-    primitive,
     row_basis,
-    written_fraction,
     zeros_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil
 
 #: Plants with more unknowns are not reduced exactly, as the numbers grow: their fault polynomials come from pencils.
 MOST_REDUCED = 24

@@ -21,7 +21,9 @@ from obsynth.numerics.invariant_zeros import are_outside
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import written_matrix
+from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.rational_matrices import (
     blocks,
     left_null_basis,
     null_basis,
@@ -29,10 +31,8 @@ from obsynth.proofs.exact_arithmetic import (
     picked_rows,
     pivot_columns,
     row_basis,
-    written_matrix,
     zeros_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil
 
 
 def dc_point(dt: float) -> complex:

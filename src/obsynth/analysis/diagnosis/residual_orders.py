@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, TRACE_TOLERANCE
 from obsynth.numerics.staircase import full_svd
-from obsynth.proofs.exact_arithmetic import blocks, picked_columns, zeros_matrix
+from obsynth.proofs.rational_matrices import blocks, picked_columns, zeros_matrix
 
 
 def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: fmpq_mat, L: fmpq_mat) -> int | None:

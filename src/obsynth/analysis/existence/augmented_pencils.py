@@ -18,7 +18,9 @@ from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, stated_eigenvalues
-from obsynth.proofs.exact_arithmetic import blocks, identity, primitive, written_matrix, zeros_matrix
+from obsynth.proofs.exact_doubles import written_matrix
+from obsynth.proofs.polynomial_roots import primitive
+from obsynth.proofs.rational_matrices import blocks, identity, zeros_matrix
 
 #: An imaginary part below this share of an eigenvalue is not shown: it would not change its printed digits.
 UNSEEN = 5e-7

@@ -26,7 +26,7 @@ from obsynth.numerics.ranks import (
 from obsynth.numerics.scaling import Scaling
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.proofs.exact_arithmetic import blocks, identity, left_null_basis, picked_columns, zeros_matrix
+from obsynth.proofs.rational_matrices import blocks, identity, left_null_basis, picked_columns, zeros_matrix
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20

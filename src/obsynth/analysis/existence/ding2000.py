@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
-from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.proofs.exact_doubles import holds_computed
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: The zeros of pencils with more columns are left to the Riccati equation.

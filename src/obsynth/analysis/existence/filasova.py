@@ -25,7 +25,7 @@ from obsynth.plants.signal_names import MOST_NAMES, leading_names
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.index_reduction import improper_outputs
 from obsynth.plants.transformations.recovery import Transformation
-from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.proofs.exact_doubles import holds_computed
 from obsynth.proofs.exact_pencils import ExactPencil
 
 _SOURCE = "Filasova et al., eqs. (1), (2)"

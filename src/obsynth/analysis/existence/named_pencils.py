@@ -29,7 +29,7 @@ from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem
 from obsynth.plants.plant_units import PlantUnits, sized_plant
-from obsynth.proofs.exact_arithmetic import written_fraction
+from obsynth.proofs.exact_doubles import written_fraction
 
 #: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
 WITNESS_DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)

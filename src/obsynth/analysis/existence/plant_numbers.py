@@ -14,17 +14,16 @@ from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE
 from obsynth.proofs.enclosed_pencils import EnclosedPencil, bits_for, exponential, rank_to_digits
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import holds_computed, written_matrix
+from obsynth.proofs.exact_pencils import ExactPencil, system_pencil
+from obsynth.proofs.rational_matrices import (
     blocks,
-    holds_computed,
     picked_columns,
     picked_rows,
     rank_of,
     rational_matrix,
-    written_matrix,
     zeros_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil, system_pencil
 
 #: Degree of the minimal polynomial of an eigenvalue times columns of the pencil.  Above it the rank at the eigenvalue
 #: is decided in floating point.

@@ -34,7 +34,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem
 from obsynth.plants.plant_units import PlantUnits, sized_plant
 from obsynth.proofs.balls import UNIT_ROUNDOFF
-from obsynth.proofs.exact_arithmetic import blocks, picked_rows
+from obsynth.proofs.rational_matrices import blocks, picked_rows
 
 #: What decides what rounding of the data leaves open.
 DECIDER = "Data with more digits, or an output that is more sensitive to it, would decide it."

@@ -34,7 +34,7 @@ from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
 from obsynth.plants.transformations.redundant_outputs import merged_outputs
-from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
+from obsynth.proofs.rational_matrices import blocks, picked_columns, pivot_columns, zeros_matrix
 
 #: Conditions in order, the prepared plant on which the last were decided, and the fault zeros where they were reached.
 _Examination: TypeAlias = tuple[tuple[Condition, ...], PreparedPlant | None, tuple[complex, ...] | None]

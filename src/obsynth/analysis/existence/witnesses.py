@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.faults import Exosystem
-from obsynth.proofs.exact_arithmetic import written_fraction
+from obsynth.proofs.exact_doubles import written_fraction
 
 #: At most so many changes are listed.
 LISTED_CHANGES = 4

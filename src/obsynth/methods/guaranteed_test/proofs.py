@@ -15,7 +15,7 @@ from obsynth.methods.guaranteed_test.condensed import LEAST_WEIGHT, Condensed
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, rounded_up
-from obsynth.proofs.exact_arithmetic import ScaledIntegers, rounded_outward, scaled_integers
+from obsynth.proofs.exact_doubles import ScaledIntegers, rounded_outward, scaled_integers
 from obsynth.proofs.nearby_solutions import NearbySolution, nearby_solution, rational_correction
 
 #: A bounded number so near to its bound, as a share of it, is at its bound.

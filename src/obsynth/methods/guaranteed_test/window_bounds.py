@@ -18,7 +18,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.plants.transformations.remainders import continuous_model
-from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.exact_doubles import rounded_outward
 
 
 def fault_of(names: tuple[str, ...], name: str | None) -> int:

@@ -35,7 +35,7 @@ from obsynth.plants.transformations.recovery import (
 )
 from obsynth.plants.transformations.sparse_elimination import INDEX_ADVICE, not_index_one, reduced_by_sparsity
 from obsynth.plants.uncertainty import ELIMINATED
-from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.proofs.exact_doubles import holds_computed
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500

@@ -19,19 +19,16 @@ from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import holds_computed, written_fraction, written_matrix, written_rows
+from obsynth.proofs.rational_matrices import (
     blocks,
     fractions_of,
-    holds_computed,
     identity,
     nearest_doubles,
     null_basis,
     picked_columns,
     picked_rows,
     pivot_columns,
-    written_fraction,
-    written_matrix,
-    written_rows,
     zeros_matrix,
 )
 

@@ -34,17 +34,16 @@ from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation, state_point, with_states
-from obsynth.proofs.exact_arithmetic import (
+from obsynth.proofs.exact_doubles import holds_computed, written_matrix
+from obsynth.proofs.rational_matrices import (
     blocks,
     fractions_of,
-    holds_computed,
     identity,
     nearest_doubles,
     null_basis,
     picked_columns,
     picked_rows,
     pivot_columns,
-    written_matrix,
 )
 
 #: Points, in the plant's own unit of time, of which the farthest from an eigenvalue is taken in floating point.

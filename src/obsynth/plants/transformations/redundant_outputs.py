@@ -26,7 +26,8 @@ from obsynth.numerics.ranks import (
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
+from obsynth.proofs.exact_doubles import written_matrix
+from obsynth.proofs.rational_matrices import pivot_columns
 
 #: White noise that is added to noise without any in some direction, as a share of its largest: perfect sensors have a
 #: weight of nearly one then, and a mean stays unbiased to as many digits.

@@ -17,7 +17,8 @@ from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import as_written
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
-from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
+from obsynth.proofs.exact_doubles import written_matrix
+from obsynth.proofs.rational_matrices import nearest_doubles, null_basis, pivot_columns
 
 #: Boxes after which a statement is left open.
 MOST_BOXES = 150
