@@ -6,9 +6,11 @@ import inspect
 from collections.abc import Callable
 from functools import cache
 
+import control
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import signal
 
 import obsynth
 from obsynth import SpecError, conditions, plotting
@@ -133,3 +135,28 @@ def test_names_of_outputs_may_be_an_array_beside_noise_by_name():
 def test_arguments_of_the_right_kind_are_not_judged_by_their_class():
     diagnosed = obsynth.diagnose(plant(**FAULTY), frequencies=np.array([0.1]), suggest=np.True_)
     assert diagnosed.faults
+
+
+A_PLANT = {"A": [[0.9, 0.1], [0.0, 0.8]], "C": [[1.0, 0.0]], "Bf": [[1.0], [0.0]], "dt": 1.0}
+OTHER_PLANTS = {
+    "python-control": (lambda: control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), "by obsynth.from_control(model)"),
+    "scipy": (lambda: signal.StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), "by obsynth.from_scipy(model)"),
+    "a mapping": (lambda: A_PLANT, "obsynth.DescriptorSystem(**plant)"),
+}
+
+
+@pytest.mark.parametrize("kind", OTHER_PLANTS)
+@pytest.mark.parametrize(
+    "take", [obsynth.fault_estimation_filter, obsynth.check, obsynth.design, obsynth.diagnose, conditions.wang2015]
+)
+def test_what_makes_a_plant_of_another_one_is_told(kind, take):
+    made, told = OTHER_PLANTS[kind]
+    with pytest.raises(SpecError, match=r"plant is a .*: give an obsynth\.DescriptorSystem") as refused:
+        take(made())
+    assert told in str(refused.value)
+
+
+def test_what_is_told_makes_a_plant():
+    assert obsynth.DescriptorSystem(**A_PLANT).nf == 1
+    assert obsynth.from_control(OTHER_PLANTS["python-control"][0]()).nx == 1
+    assert obsynth.from_scipy(OTHER_PLANTS["scipy"][0]()).nx == 1

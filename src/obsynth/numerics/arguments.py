@@ -59,6 +59,15 @@ _BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
 }
 
 
+#: What makes a plant of the models of other libraries.
+_IMPORTERS: Mapping[str, str] = {
+    "control": "obsynth.from_control",
+    "scipy": "obsynth.from_scipy",
+    "casadi": "obsynth.from_casadi",
+    "pandas": "obsynth.from_pandas",
+    "andes": "obsynth.from_andes",
+}
+
 #: How a message asks for what an annotation says, by name; what is not here is called by its own name.
 _WORDS: Mapping[str, str] = {
     "bool": "True or False",
@@ -318,6 +327,11 @@ def _suggestion(value: Any, expected: Sequence[str]) -> str:
         return f" The plant of a spec is obsynth.load_spec({str(value)!r}).plant."
     if "DescriptorSystem" in expected and type(value).__name__ == "Spec":
         return " The plant of a spec is spec.plant."
+    if "DescriptorSystem" in expected and isinstance(value, Mapping):
+        return " Of its arguments a mapping makes one: obsynth.DescriptorSystem(**plant)."
+    library = type(value).__module__.partition(".")[0]
+    if "DescriptorSystem" in expected and library in _IMPORTERS:
+        return f" A model of {library} becomes one by {_IMPORTERS[library]}(model)."
     if expected == ["str"] and hasattr(value, "__name__"):
         return f" Did you mean {value.__name__.replace('_', '-')!r}?"
     return ""
