@@ -11,8 +11,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.transformations.uncertain_plant import affine_plant
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
-from obsynth.verification.over_tolerances.plants_of_the_box import _summed_response
 from obsynth.verification.over_tolerances.responses import largest_factor, loop_radius, responses_of, ring_length
+from obsynth.verification.over_tolerances.vertex_gains import _summed_response
 
 #: What contraction of the ring and rounding may add to a sum, relatively.
 SHARE = 1e-3

@@ -6,7 +6,7 @@ import pytest
 from uncertain_plants import drive
 
 import obsynth
-from obsynth.verification.over_tolerances.plants_of_the_box import acting_like_faults
+from obsynth.verification.over_tolerances.constants_like_faults import acting_like_faults
 
 
 @pytest.fixture(scope="module")

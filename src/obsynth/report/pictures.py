@@ -1,4 +1,4 @@
-"""Pictures of a design for a page: drawn without a window, held as text."""
+"""Pictures of a design on its HTML page, drawn without a display and stored as data URLs."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: More states than this are not drawn.
+#: Designs with more states get no picture of states.
 MOST_DRAWN_STATES = 6
 
 
 class Picture(NamedTuple):
-    """A picture in a page: what it shows, in words for who cannot see it and as a caption, and a data URL."""
+    """A picture in a page: title, text (the caption, and for readers who cannot see it), and image as a data URL."""
 
     title: str
     text: str
@@ -44,7 +44,7 @@ class Picture(NamedTuple):
     wide: bool = False
 
     def html(self) -> str:
-        """Return the picture as a figure; a wide one takes a row of its own."""
+        """Return the picture as an HTML figure; a wide one takes a row of its own."""
         title = f"<h3>{escape(self.title)}</h3>" if self.title else ""
         return (
             f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
@@ -54,9 +54,9 @@ class Picture(NamedTuple):
 
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
     """Yield the pictures of a design."""
-    yield from _at_work(design, scenario)
+    yield from _simulation_pictures(design, scenario)
     if design.method == GuaranteedTestMethod.id:
-        yield from _hidden(GuaranteedTest.of(design))
+        yield from _test_pictures(GuaranteedTest.of(design))
     if design.method == OptimalFilterMethod.id and len(OptimalFilter.of(design).trade_off) > 1:
         text = (
             "The least gain and the least deviation of any filter with an exact fault map against its delay, as the "
@@ -91,8 +91,8 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
         )
 
 
-def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
-    """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
+def _test_pictures(test: GuaranteedTest) -> Iterator[Picture]:
+    """Yield the least threshold against the number of samples, and a fault profile that no test can detect."""
     if len(test.tests) == 1:
         if len(test.trade_off) > 1:
             text = (
@@ -126,19 +126,19 @@ def _gains_picture(design: ObserverDesign, to: str, title: str, text: str) -> Pi
 
 
 def shown_simulation(design: ObserverDesign, scenario: Scenario | None) -> tuple[Scenario, Simulation] | None:
-    """Return the scenario that a page shows and its simulation; `None` where the plant has no demonstration."""
+    """Return the given or a demonstration scenario with its simulation; `None` where the plant has no demonstration."""
     try:
-        shown = scenario if scenario is not None else demonstration_scenario(design)
-        return None if shown is None else (shown, simulate(design, shown))
+        used = scenario if scenario is not None else demonstration_scenario(design)
+        return None if used is None else (used, simulate(design, used))
     except ObsynthError:
-        # Without a scenario of its own, a page is whole without this picture.
+        # A page without a given scenario is complete without this picture.
         if scenario is not None:
             raise
         return None
 
 
-def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
-    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
+def _simulation_pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
+    """Yield faults and states with their estimates in a simulation; nothing where the plant has no demonstration."""
     demonstration, is_stated = shown_simulation(design, scenario), scenario is not None
     if demonstration is None:
         return
@@ -148,7 +148,7 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
     text = f"{what}: {_story(used, is_stated=is_stated, linear=linear)}"
     faults, states = len(design.observer.fault_names), simulation.estimates.state_names
     units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    first_detections = [*_watched(design, used, simulation)] if is_stated else []
+    first_detections = [*_detections(design, used, simulation)] if is_stated else []
     if faults or first_detections:
         yield stacked(
             "The design at work",
@@ -167,8 +167,8 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
         )
 
 
-def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
-    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
+def _detections(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
+    """Yield the detections of the first monitor that fits design and scenario; nothing where none does."""
     if is_registered("detections"):
         yield from registered("detections")(design, scenario, simulation)
 
@@ -189,10 +189,10 @@ def _story(scenario: Scenario, *, is_stated: bool, linear: bool) -> str:
 
 
 def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]], Any]) -> Picture:
-    """Return a wide picture of so many panels."""
+    """Return a wide picture of several panels, one above the other."""
     return Picture(title, text, drawn((WIDE, PANEL * panels + EDGE), panels, draw), wide=True)
 
 
 def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
-    """Return what ``draw`` puts on panels one above the other, as a data URL."""
+    """Return the picture that ``draw`` makes on panels one above the other, as a data URL."""
     return data_url(image_of(panels, draw, size=size))

@@ -1,4 +1,7 @@
-"""Functions of upper rooms that methods of results call: registered by `obsynth`, which is above every room."""
+"""Registry of functions of upper rooms that lower rooms call by name; `obsynth/__init__.py` registers them.
+
+Lower rooms do not import upper ones, but a design's methods, such as its summary, need functions from there.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,15 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {}
 
 
 def register(**functions: Callable[..., Any]) -> None:
-    """Register functions by the names under which lower rooms call them."""
+    """Register functions under the names by which lower rooms call them."""
     _FUNCTIONS.update(functions)
 
 
 def is_registered(name: str) -> bool:
-    """Whether a function of this name is there: rooms above may be left out of an installation."""
+    """Whether a function has this name: an installation may lack the room that registers it."""
     return name in _FUNCTIONS
 
 
 def registered(name: str) -> Callable[..., Any]:
-    """Return the function that was registered by this name."""
+    """Return the function that is registered under this name."""
     return _FUNCTIONS[name]

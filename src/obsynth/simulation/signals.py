@@ -1,4 +1,4 @@
-"""The signals of a scenario as arrays, for one plant and one sample time."""
+"""Signals of a scenario as arrays: known inputs, faults and disturbances of one plant at one sample time."""
 
 from __future__ import annotations
 
@@ -19,21 +19,37 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, LostEffectiveness, Profile, Random, Stuck
 from obsynth.simulation.scenario import FAILURES, Scenario, profiles_of
 
-#: A simulation holds every sample in memory: a typing error in a horizon must not fill it.
+#: Most samples of a simulation, which keeps all of them in memory: a mistyped horizon must not fill it.
 MAXIMUM_SAMPLES = 5_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioSignals:
-    """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those."""
+    """The signals of a scenario for one plant, before random numbers are drawn.
+
+    Parameters
+    ----------
+    dt : float
+        Seconds between samples.
+    at_begin, at_end : FloatArray
+        ``[u, f, d]`` at the beginning and at the end of each interval, ``(steps, nu + nf + nd)``.
+    random : tuple
+        Column and profile of each random signal.
+    sensors : tuple
+        Output and profile of each faulty sensor.
+    noise : float
+        Factor of the plant's stated noise.
+    deviations : FloatArray
+        Standard deviations of additional sensor noise ``(ny,)``.
+    """
 
     dt: float
-    at_begin: FloatArray  # (steps, nu + nf + nd): [u, f, d] where each interval begins
-    at_end: FloatArray  # where it ends
+    at_begin: FloatArray
+    at_end: FloatArray
     random: tuple[tuple[int, Random], ...]
     sensors: tuple[tuple[int, Profile], ...]
     noise: float
-    deviations: FloatArray  # (ny,) of more noise
+    deviations: FloatArray
 
     @property
     def steps(self) -> int:
@@ -41,7 +57,7 @@ class ScenarioSignals:
         return len(self.at_begin)
 
     def drawn(self, seeds: Sequence[int], nw: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the seeds add: signals, plant noise, sensor noise, ``(steps, runs, *)`` each."""
+        """Return random signals, plant noise and sensor noise for these seeds, each ``(steps, runs, *)``."""
         steps, ny = self.steps, len(self.deviations)
         signals = np.zeros((steps, len(seeds), self.at_begin.shape[1]))
         noise, sensors = np.zeros((steps, len(seeds), nw)), np.zeros((steps, len(seeds), ny))
@@ -56,7 +72,7 @@ class ScenarioSignals:
         return signals, noise, sensors
 
     def measured(self, outputs: FloatArray) -> FloatArray:
-        """Return outputs ``(steps, runs, ny)`` as the faulty sensors show them."""
+        """Return the measurements of faulty sensors from outputs ``(steps, runs, ny)``."""
         measurements = outputs.copy()
         for column, profile in self.sensors:
             acts = profile.active(self.steps, self.dt)
@@ -86,7 +102,7 @@ def resolve(plant: DescriptorSystem | PolytopicSystem, scenario: Scenario) -> Sc
 def resolve_parameters(
     plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float
 ) -> ScenarioSignals:
-    """Return the signals of ``scenario`` for a plant with parameters: ``[u, theta]``, less their nominal values."""
+    """Return the signals of ``scenario`` for a plant with parameters: ``[u, theta]``, as differences from nominal."""
     check_parameters(plant, scenario)
     if scenario.sample_time is not None and scenario.sample_time != dt:
         raise SpecError(
@@ -104,7 +120,7 @@ def resolve_parameters(
 
 
 def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario) -> None:
-    """Raise where a scenario says what a plant with parameters does not have."""
+    """Raise `SpecError` where a scenario has something that plants with parameters do not have."""
     scenario.check_names(plant)
     for name, profile in profiles_of(scenario, "faults"):
         if isinstance(profile, FAILURES):
@@ -157,7 +173,7 @@ def _resolved(
     random.sort(key=lambda item: item[0])
     uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
     if uncertain is not None and uncertain.shift and uncertain.shift not in scenario.inputs:
-        # What the equilibrium's motion enters through is one, always.
+        # The input through which the shift of the equilibrium enters is always one.
         column = plant.input_names.index(uncertain.shift)
         at_begin[:, column] = at_end[:, column] = 1.0
     sensors = [
@@ -171,8 +187,7 @@ def _resolved(
 def _form_derivatives(
     inputs: Sequence[str], scenario: Scenario, at_begin: FloatArray, at_end: FloatArray, dt: float
 ) -> None:
-    """Write derivatives of known inputs for which no profile is given, by differences from sample to sample as in runs
-    on logs."""
+    """Fill in derivatives of known inputs that have no profile, by the differences that runs on logs use."""
     times = np.arange(len(at_begin), dtype=np.float64) * float(dt)
     for column, name in enumerate(inputs):
         base = None if name in scenario.inputs else derivative_of(name, inputs)
@@ -188,7 +203,7 @@ def _form_derivatives(
 
 
 def _lost_command(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:
-    """Return what a failing actuator adds to the command."""
+    """Return the signal that a failing actuator adds to its command."""
     if isinstance(profile, LostEffectiveness):
         return np.asarray(-profile.share * commanded)
     value = profile.value if isinstance(profile, Stuck) else None
@@ -196,7 +211,7 @@ def _lost_command(profile: Profile, commanded: FloatArray, acts: np.ndarray, bef
 
 
 def _actuator(plant: DescriptorSystem | PolytopicSystem, fault: str, scenario: Scenario) -> int:
-    """Return the input whose columns of B and D are those of the fault."""
+    """Return the index of the input whose columns of B and D are those of the fault."""
     where = f"faults.{fault}"
     if scenario.stabilise:
         raise SpecError(
@@ -227,7 +242,7 @@ def signals_of(
 
 
 def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> FloatArray:
-    """Return a signal over a record, zero where none is given; a list of numbers is a single one."""
+    """Return a signal ``(steps, size)`` over a record: zeros for `None`, one column for a list of numbers."""
     if value is None or (0 in shape and not np.size(value)):
         return np.zeros(shape)
     array = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")

@@ -26,13 +26,8 @@ from obsynth.plants.uncertainty import SAMPLED, as_written
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.studies.robustness_result import Robustness
-from obsynth.verification.over_tolerances.plants_of_the_box import (
-    EXACT_MODEL,
-    acting_like_faults,
-    plant_as_written_at,
-    vertex_gains,
-    with_tolerances,
-)
+from obsynth.verification.over_tolerances.constants_like_faults import acting_like_faults
+from obsynth.verification.over_tolerances.plants_of_the_box import plant_as_written_at
 from obsynth.verification.over_tolerances.responses import (
     Responses,
     blame,
@@ -42,6 +37,7 @@ from obsynth.verification.over_tolerances.responses import (
     responses_of,
     same_sample_inverse,
 )
+from obsynth.verification.over_tolerances.stated_tolerances import EXACT_MODEL, with_tolerances
 from obsynth.verification.over_tolerances.subdivision import (
     MOST_BOXES,
     BoxVerdict,
@@ -49,6 +45,7 @@ from obsynth.verification.over_tolerances.subdivision import (
     proved_stable,
     values_at,
 )
+from obsynth.verification.over_tolerances.vertex_gains import vertex_gains
 
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40

@@ -19,8 +19,9 @@ from obsynth.results.certificate_files import RESULT_FILE, SHOWN_DIGITS, result_
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import ROBUSTNESS
-from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, MOST_VERTICES
 from obsynth.verification.over_tolerances.responses import LARGEST_FACTOR
+from obsynth.verification.over_tolerances.stated_tolerances import EXACT_MODEL
+from obsynth.verification.over_tolerances.vertex_gains import MOST_VERTICES
 
 #: What a verdict over the box is called in texts.
 VERDICTS = {"proved": "proved", "refuted": "refuted", "open": "not decided"}

@@ -1,6 +1,6 @@
-"""Checks of every linear observer, of any method: its signals fit the plant, and its state decays.
+"""Checks of every linear observer, whatever its method: its signals fit the plant, and its state decays.
 
-A method's own rows may be anything; these follow from the plant and the stored numbers alone.
+They need only the plant and the stored numbers, so that a method of another package cannot leave them out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SOURCE = "ours, for every linear observer"
 
 
 def platform_rows(plant: DescriptorSystem, observer: LinearObserver, *, open_loop: bool) -> Iterator[Check]:
-    """Yield the rows that no method can leave out; of an ``open_loop`` model decay is no claim."""
+    """Yield the checks that no method can leave out; an ``open_loop`` model makes no claim of decay."""
     wrong = _unfitting(plant, observer)
     yield nothing_wrong("signals", "signals and sample time fit the plant", wrong, source=SOURCE)
     if wrong:
@@ -47,7 +47,7 @@ def platform_rows(plant: DescriptorSystem, observer: LinearObserver, *, open_loo
 
 
 def _unfitting(plant: DescriptorSystem, observer: LinearObserver) -> list[str]:
-    """Return what does not belong to the plant."""
+    """Return the names and times of an observer that do not fit the plant."""
     pairs = (
         ("names of inputs", observer.input_names == plant.input_names),
         ("names of outputs", observer.output_names == plant.output_names),
@@ -59,7 +59,7 @@ def _unfitting(plant: DescriptorSystem, observer: LinearObserver) -> list[str]:
 
 
 def _outermost(observer: LinearObserver) -> str:
-    """Return the pole that decays least, in words."""
+    """Return the slowest or most unstable eigenvalue, in words."""
     poles = poles_of(observer)
     pole = complex(poles[int(np.argmax(np.abs(poles) if observer.dt > 0.0 else poles.real))])
     return f"an eigenvalue of {pole.real:.6g}" + (f"{pole.imag:+.6g}j" if pole.imag else "")

@@ -1,7 +1,7 @@
-"""Limits that the options of a design state (decay, region, poles, gains), against what its stored numbers reach.
+"""Checks that a design keeps the limits in its options: decay, region, poles, gains.
 
-A design that is read from a file is printed with its options.  A rate, a region or a gain that was asked for and is not
-reached would be read as if it were.
+A design from a file is printed with its options.  Without these checks a reader would believe that a requested rate,
+region or gain is reached.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.inequalities import decay_row
 
-#: Which side of a claim an option bounds; a factor is that by which errors decay in a sample.
+#: How an option bounds a claim; "factor": the option is a rate, and the claim a factor per sample.
 Bound: TypeAlias = Literal["at least", "at most", "equal", "factor"]
 
-#: For an option, the claim that it bounds; of a list of numbers, one for each.
+#: The claims that an option bounds, one for each number of the option, by the option's name.
 Limits: TypeAlias = Mapping[str, tuple[tuple[str, Bound], ...]]
 
-#: Poles may be outside a region by this share of the terms of its inequality, and miss those asked for by this share
-#: of their size: they were placed, and found again, in double precision.
+#: Poles may lie outside a region by this share of the terms of its inequality, and differ from requested poles by this
+#: share of their size: they were placed and recomputed in double precision.
 POLE_TOLERANCE = 1e-4
 
-#: Claims may miss what was asked for by this share: the two are compared in the units of different coordinates.
+#: Claims may exceed a requested limit by this share: the two are computed in different coordinates.
 CLAIM_TOLERANCE = 1e-6
 
 _SOURCE = "options, and the stored numbers"
@@ -49,10 +49,18 @@ def requested_rows(
     placed: frozenset[str],
     fixed_modes: Callable[[ObserverDesign], Sequence[complex]],
 ) -> Iterator[Check]:
-    """Yield a row for each number that the options ask for.
+    """Yield a check for each limit in the options.
 
-    ``placed`` holds which of decay, region and poles are about the eigenvalues of the observer; ``fixed_modes`` returns
-    those that no gain moves, and is called where a row fails without it.
+    Parameters
+    ----------
+    design : ObserverDesign
+        The design.
+    limits : mapping
+        The claims that options bound.
+    placed : frozenset of str
+        Which of decay, region and poles are requests on the eigenvalues of the observer.
+    fixed_modes : callable
+        Returns the modes that no gain moves; called only where a check fails without it.
     """
     options, observer = design.options, design.observer
     requested = {name: bounds for name, bounds in limits.items() if options.get(name) is not None}
@@ -67,7 +75,7 @@ def requested_rows(
     wanted = {name: options[name] for name in ("decay", "region", "poles") if name in placed and name in options}
     wanted = {name: value for name, value in wanted.items() if value is not None}
     if not isinstance(observer, LinearObserver):
-        # One that changes with the scheduling has no poles: what bounds its errors is a claim.
+        # A scheduled observer has no poles: claims bound its errors instead.
         wrong = [name for name in wanted if name not in limits]
         if wrong:
             claim = "no poles are requested of an observer that changes with the scheduling"
@@ -101,7 +109,7 @@ def requested_rows(
 
 @dataclass(frozen=True, eq=False)
 class _Modes:
-    """The poles of an observer, computed once and where a row asks for them."""
+    """The poles of an observer, each kind computed when a check first needs it."""
 
     design: ObserverDesign
     observer: LinearObserver
@@ -109,7 +117,7 @@ class _Modes:
 
     @cached_property
     def poles(self) -> ComplexArray:
-        """All of them, with more digits than double precision gives where that is practical."""
+        """All poles, more accurate than in double precision where that is affordable."""
         enclosed = enclosed_eigenvalues(self.observer.Az)
         if enclosed is None:
             return poles_of(self.observer)
@@ -117,12 +125,12 @@ class _Modes:
 
     @cached_property
     def fixed(self) -> Sequence[complex]:
-        """Those that no gain moves, from the plant."""
+        """The modes of the plant that no gain moves."""
         return self.fixed_modes(self.design)
 
     @cached_property
     def movable(self) -> ComplexArray:
-        """The poles without the fixed ones, each of which must be where the plant has it."""
+        """The poles without those that agree with a fixed mode of the plant."""
         poles, fixed = self.poles, np.asarray(self.fixed, dtype=np.complex128)
         if not fixed.size or fixed.size > poles.size:
             return poles
@@ -131,8 +139,7 @@ class _Modes:
 
 
 def region_of(region: Any, dt: float) -> LMIRegion:
-    """Return the region of an option: by name (decay, radius, damping), by its matrices, or as `checked_region` takes
-    it."""
+    """Return the region of an option: by decay, radius and damping, by its matrices, or as in `checked_region`."""
     if isinstance(region, Mapping) and region.keys() == {"L", "M"}:
         L, M = (real_array(region[name], f"region.{name}") for name in ("L", "M"))
         if L.ndim != 2 or L.shape != L.shape[::-1] or M.shape != L.shape or not np.isfinite([L, M]).all():
@@ -145,7 +152,7 @@ def region_of(region: Any, dt: float) -> LMIRegion:
 
 
 def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], ...]) -> Iterator[str]:
-    """Yield what is claimed and is not within an option."""
+    """Yield a text for each claim that exceeds the limit of an option."""
     claims, value = design.certificate.claims, design.options[name]
     numbers = list(value) if len(bounds) > 1 and isinstance(value, (list, tuple)) else [value]
     if len(numbers) != len(bounds) or not all(map(is_finite_number, numbers)):
@@ -153,7 +160,7 @@ def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], 
         return
     for number, (claim, bound) in zip(map(float, numbers), bounds, strict=True):
         reached = claimed(claims, claim)
-        if bound == "factor":  # of a rate, in a sample
+        if bound == "factor":
             number, bound = float(np.exp(-number * design.observer.dt)), "at most"
         slack = CLAIM_TOLERANCE * abs(number)
         holds = {
@@ -166,21 +173,22 @@ def _beyond(design: ObserverDesign, name: str, bounds: tuple[tuple[str, Bound], 
 
 
 def _decay_row(modes: _Modes, rate: float) -> Check:
-    """Return the row that all modes but the fixed ones decay at a rate."""
+    """Return the check that all modes except the fixed ones decay at a rate."""
     observer = modes.observer
     row = decay_row(observer, rate)
     claim = "every mode decays at the rate (1/s) of the option decay, or faster"
     if row.passed or not len(modes.fixed):
         return replace(row, name="requested decay", claim=claim)
-    # By the shape of the region: a mode that is fixed may be slower.
+    # A fixed mode may be slower: check the others, as poles in a half plane or disk.
     inside = _region_row(modes, NamedRegion(decay=rate).as_inequality(observer.dt))
     return replace(inside, name="requested decay", claim=f"{claim}, but for the {len(modes.fixed)} that no gain moves")
 
 
 def _region_row(modes: _Modes, region: LMIRegion) -> Check:
-    """Return the row that poles lie in a region, relative to the terms of its inequality.
+    """Return the check that the poles lie in a region, relative to the terms of its inequality.
 
-    Where all of them do, those that no gain moves are not asked for."""
+    The modes that no gain moves are computed and left out only if some pole lies outside.
+    """
     outside = _outside(modes.poles, region)
     if outside > POLE_TOLERANCE:
         outside = _outside(modes.movable, region)
@@ -194,18 +202,19 @@ def _region_row(modes: _Modes, region: LMIRegion) -> Check:
 
 
 def _outside(values: ComplexArray, region: LMIRegion) -> float:
+    """Return how far the farthest value lies outside a region, relative to the terms of its inequality."""
     size = np.linalg.norm(region.L, 2) + 2.0 * np.abs(values) * np.linalg.norm(region.M, 2)
     return float(np.max(-region.margins(values) / np.where(size > 0.0, size, 1.0), initial=-1.0))
 
 
 def _readings(poles: Any) -> list[list[complex]]:
-    """Return what a list of poles may mean: a pair of numbers is one pole, or the two of one of several filters."""
+    """Return both meanings of a list of poles: a pair of numbers is one complex pole, or two poles of one filter."""
     if not isinstance(poles, (list, tuple, np.ndarray)):
         raise SpecError(f"poles are no list, but {shown(poles)}.", path="poles")
-    pairs, lists = list[complex](), list[complex]()
+    with_pairs, with_lists = list[complex](), list[complex]()
     for entry in poles:
         several = isinstance(entry, (list, tuple, np.ndarray))
-        lists += [as_pole(pole) for pole in entry] if several else [as_pole(entry)]
+        with_lists += [as_pole(pole) for pole in entry] if several else [as_pole(entry)]
         paired = several and len(entry) == 2 and all(map(is_number, entry))
-        pairs += [as_pole(pole) for pole in entry] if several and not paired else [as_pole(entry)]
-    return [pairs, lists]
+        with_pairs += [as_pole(pole) for pole in entry] if several and not paired else [as_pole(entry)]
+    return [with_pairs, with_lists]

@@ -30,8 +30,8 @@ from obsynth.verification.assumptions import Assumptions
 from obsynth.verification.over_tolerances.adaptive_bound import Start, adaptive_bound
 from obsynth.verification.over_tolerances.adaptive_recursion import AdaptivePlan
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
-from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, with_tolerances
 from obsynth.verification.over_tolerances.responses import loop_radius
+from obsynth.verification.over_tolerances.stated_tolerances import EXACT_MODEL, with_tolerances
 from obsynth.verification.over_tolerances.subdivision import index_one_on_box, values_at
 
 #: Radii of a set are made larger by this share: more than the rounding of their sums.

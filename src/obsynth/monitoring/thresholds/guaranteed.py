@@ -28,7 +28,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.benches import make_bench
 from obsynth.simulation.scenario import Scenario
-from obsynth.verification.over_tolerances.plants_of_the_box import with_tolerances
+from obsynth.verification.over_tolerances.stated_tolerances import with_tolerances
 
 #: Options that other designs leave to their monitor.
 STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma", "disturbance")

@@ -1,4 +1,4 @@
-"""The spectrum of an observer with the limit of stability, and the region that was asked for."""
+"""Plot of an observer's eigenvalues in the complex plane, with the limit of stability and the requested region."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: From this ratio of the fastest to the slowest part on, axes are logarithmic away from zero.
+#: Axes are logarithmic away from zero where real or imaginary parts differ by more than this factor.
 WIDE_RATES = 30.0
 
-#: Points of the grid on which a region is found, each way.
+#: Points in each direction of the grid on which a region is evaluated.
 REGION_GRID = 400
 
 _LIMIT: dict[str, Any] = {"color": "0.45", "linewidth": 1.0, "linestyle": "--"}
@@ -51,38 +51,38 @@ _ZEROS: dict[str, Any] = {
     "zorder": 3,
 }
 
-#: How far a complex number is outside of a part of the region: negative inside.
+#: A function that is positive for complex numbers outside a part of the region, and negative inside.
 Excess = Callable[[ComplexArray], FloatArray]
 
-#: Damping ratios of the grid behind poles, and the natural frequencies along its lines: many decades in 1/s, of sampled
-#: poles rad per sample.
+#: Damping ratios of the lines behind the poles, and the natural frequencies along these lines: many decades in 1/s, or
+#: rad per sample for sampled poles.
 DAMPING_RATIOS = (0.2, 0.4, 0.6, 0.8)
 RATES = np.concatenate([[0.0], np.geomspace(1e-9, 1e9, 400)])
 RATES_PER_SAMPLE = np.linspace(0.0, np.pi, 200)
 
-#: Labels of that grid closer than this share of the axes would hide each other.
+#: Least distance between labels of these lines, as a share of the axes, so that they do not overlap.
 LABELS_APART = 0.04
 
-#: Ticks of a logarithmic axis on both sides of zero.
+#: Most ticks of a logarithmic axis, on both sides of zero together.
 MOST_DECADE_TICKS = 7
 
 
 @arguments_checked
 def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
-    """Plot the observer's eigenvalues and the plant's fault zeros, the limit of stability, and the region asked for.
+    """Plot the observer's eigenvalues, the plant's fault zeros, the limit of stability, and the requested region.
 
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method, either time.
+        A design with a linear observer, in discrete or continuous time.
     axes : Axes, optional
-        New ones by default.
+        Where to plot; by default new axes.
 
     Returns
     -------
     Axes
-        The complex plane: with the unit circle in discrete time; in 1/s with the imaginary axis in continuous time,
-        logarithmic away from zero where the eigenvalues spread widely.
+        The complex plane, with the unit circle in discrete time, or in 1/s with the imaginary axis in continuous time.
+        Where the eigenvalues differ by decades, the scale is logarithmic away from zero.
 
     Raises
     ------
@@ -140,23 +140,23 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
         (points.imag, axes.set_yscale, axes.set_ylim),
     ):
         sizes = np.abs(values)
-        alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(points), initial=0.0)]
-        if not alive.size:
-            # As wide as the other axis: a damping grid in a flat picture would be one line.
+        nonzero = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(points), initial=0.0)]
+        if not nonzero.size:
+            # As wide as the other axis, since lines of equal damping would coincide in a flat picture.
             reach = 0.5 * float(np.max(np.abs(points), initial=0.0)) or 1.0
             limits(-reach, reach)
-        elif alive.max() > WIDE_RATES * alive.min():
-            linear = float(alive.min())
+        elif nonzero.max() > WIDE_RATES * nonzero.min():
+            linear = float(nonzero.min())
             scale("symlog", linthresh=linear)
             axis = axes.xaxis if scale == axes.set_xscale else axes.yaxis
-            # Ticks at powers of ten outside of the linear part, in which they would overlap.
+            # Ticks at powers of ten outside the linear part, within which they would overlap.
             locator = SymmetricalLogLocator(base=10.0, linthresh=10.0 ** np.ceil(np.log10(linear)))
             locator.set_params(numticks=MOST_DECADE_TICKS)
             axis.set_major_locator(locator)
             axis.set_minor_locator(NullLocator())
-            limits(*(side * 3.0 * float(max(np.max(side * values), alive.min())) for side in (-1.0, 1.0)))
+            limits(*(side * 3.0 * float(max(np.max(side * values), nonzero.min())) for side in (-1.0, 1.0)))
         else:
-            reach = 0.15 * float(alive.max())
+            reach = 0.15 * float(nonzero.max())
             limits(float(min(np.min(values), 0.0)) - reach, float(max(np.max(values), 0.0)) + reach)
     _damping_grid(axes, sampled=False)
     axes.set_xlabel("real part (1/s)")
@@ -164,7 +164,7 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
 
 
 def _damping_grid(axes: Axes, *, sampled: bool) -> None:
-    """Draw where poles have the same damping ratio, each line with its ratio, within the limits of the axes."""
+    """Draw labelled lines of equal damping ratio within the limits of the axes."""
     limits = axes.get_xlim(), axes.get_ylim()
     labelled: list[FloatArray] = []
     for ratio in DAMPING_RATIOS:
@@ -186,7 +186,7 @@ def _damping_grid(axes: Axes, *, sampled: bool) -> None:
 
 
 def region_asked_for(design: ObserverDesign) -> list[Excess]:
-    """Return the parts of the region that was asked for (or imposed and proved); none where none was."""
+    """Return the parts of the region of eigenvalues that the options request or the certificate claims, if any."""
     claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
     region = options.get("region") or {}
     region = dict(region) if isinstance(region, Mapping) else {}
@@ -208,7 +208,7 @@ def region_asked_for(design: ObserverDesign) -> list[Excess]:
 
 
 def _draw_region(axes: Axes, parts: list[Excess]) -> None:
-    """Shade where all parts hold, within the limits of the axes, on whatever scale they have."""
+    """Shade the intersection of all parts within the limits of the axes, on a linear or logarithmic scale."""
     if not parts:
         return
     scales = axes.xaxis.get_transform(), axes.yaxis.get_transform()
@@ -231,6 +231,6 @@ def _draw_region(axes: Axes, parts: list[Excess]) -> None:
 
 
 def _grid(scale: Any, limits: tuple[float, float]) -> FloatArray:
-    """Return points that are evenly spaced on a scale."""
+    """Return points that are evenly spaced on the scale of an axis."""
     low, high = scale.transform(np.array(limits))
     return np.asarray(scale.inverted().transform(np.linspace(float(low), float(high), REGION_GRID)))

@@ -1,4 +1,4 @@
-"""Rows on what a gain set stores more than once: tolerances and names, against the plant as written and the design."""
+"""Checks of the tolerances in a gain set: they are those of the plant as written and of the design's plant."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from obsynth.verification.plant import FAMILY_TOLERANCE, STORED_TWICE, relative_
 
 
 def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
-    """Yield the rows on the tolerances of a linear plant: they are those of the plant that the design is for."""
+    """Yield the checks that the stored tolerances belong to the plant that the design is for."""
     plant, source = design.plant, design.source
     uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
     if not isinstance(plant, DescriptorSystem) or uncertain is None:
@@ -56,7 +56,7 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
         missed = _family_difference(plant, uncertain)
         detail = ""
     except ObsynthError as error:
-        # No bound over the box exists: who asks for one gets an error.  The nominal plant alone is compared.
+        # No bound over the box exists, and a request for one raises an error.  The nominal plant was compared above.
         missed, detail = 0.0, f"no family over the box: {error}"
     yield upper_bound_check(
         "tolerances of the plant",
@@ -70,7 +70,7 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 def _not_nominal(plant: DescriptorSystem, uncertain: Uncertainty) -> Iterator[str]:
-    """Yield matrices whose entries are not what their texts say at the nominal values."""
+    """Yield the matrices whose entries differ from their expressions at the nominal values."""
     written = as_written(plant, uncertain)
     values = {name: item.nominal for name, item in uncertain.box.constants.items()}
     try:
@@ -86,7 +86,7 @@ def _not_nominal(plant: DescriptorSystem, uncertain: Uncertainty) -> Iterator[st
 
 
 def _not_of(uncertain: Uncertainty, source: PlantSource) -> Iterator[str]:
-    """Yield what differs between tolerances and the plant as written beside them."""
+    """Yield the names of what differs between the tolerances and the stored plant as written."""
     sampled = [size for kind, size in uncertain.steps if kind == SAMPLED]
     if uncertain.written is None:
         return
@@ -100,7 +100,7 @@ def _not_of(uncertain: Uncertainty, source: PlantSource) -> Iterator[str]:
 
 
 def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float:
-    """Return by how much the nominal plant of the family differs from the plant, beyond the family's remainders."""
+    """Return the difference between the plant and the nominal plant of its family, beyond the family's remainders."""
     box = uncertain.box
     alone = {name: replace(item, low=item.nominal, high=item.nominal) for name, item in box.constants.items()}
     family = affine_plant(plant, replace(box, constants=alone))
@@ -109,6 +109,6 @@ def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float
     differences = []
     for name in UNCERTAIN_MATRICES:
         stored, middle = np.asarray(dense(getattr(plant, name))), family.matrices[name]
-        wanted = stored @ family.coordinates if name in ("E", "A", "C") else stored
-        differences.append(relative_difference(wanted, middle.center, middle.radius))
+        expected = stored @ family.coordinates if name in ("E", "A", "C") else stored
+        differences.append(relative_difference(expected, middle.center, middle.radius))
     return float(np.max(differences))
