@@ -1,7 +1,7 @@
 r"""Observers of polytopic plants by matrix inequalities at the vertices: gain, mean square, decay.
 
-``e+ = (A - L C) e + (B - L D) w``, ``z = Cz e + Dz w`` with the matrices in the hull of vertices
-(`obsynth.verification.error_polytope`); ``Y_i = P L_i``.  With one P every change of the weights is covered:
+The error system is ``e+ = (A - L C) e + (B - L D) w``, ``z = Cz e + Dz w`` with matrices in the convex hull of vertices
+(`obsynth.verification.error_polytope`), and ``Y_i = P L_i``.  One common P covers arbitrary changes of the weights:
 
 .. math::
     \begin{bmatrix} P & 0 & (P A_i - Y_i C)^T & C_{z,i}^T \\ * & \gamma^2 I & (P B_i - Y_i D)^T & D_{z,i}^T \\
@@ -10,17 +10,18 @@ r"""Observers of polytopic plants by matrix inequalities at the vertices: gain, 
     \begin{bmatrix} P - C_z^T C_z & (P A_i - Y_i C)^T \\ * & P \end{bmatrix} > 0, \quad
     \mathrm{tr}\, B_{cl}^T P B_{cl} + |D_z|^2 < J \tag{V2}
 
-With P at each vertex and a slack G (V3) the pair (i, j) is a vertex now and at the next sample: ``P_i`` in the first
-place, ``G_i + G_i' - P_j`` in the third, and ``G_i'`` instead of P in products, ``L_i = G_i^-T F_i``; where the weight
-changes by at most ``steps`` in a sample, the pairs are the corners of a hexagon, and one G serves all.  In continuous
-time
+With P at each vertex and a slack G (V3), each inequality belongs to a pair (i, j) of vertices, now and at the next
+sample.  ``P_i`` is in the first place, ``G_i + G_i' - P_j`` in the third, ``G_i'`` replaces P in products, and
+``L_i = G_i^-T F_i``.  If the weight changes by at most ``steps`` in a sample, the pairs are the corners of a hexagon,
+with one common G.  In continuous time
 
 .. math::
     \begin{bmatrix} \mathrm{He}(P A_i - Y_i C) + C_z^T C_z & P B_i - Y_i D + C_z^T D_z \\ * & D_z^T D_z - \gamma^2 I
     \end{bmatrix} < 0 \tag{V4}
 
-with ``[[P1, 0], [P2, P3]]`` for P where the last errors are algebraic.  A remainder R beside A, ``|R| <= rho``, takes
-``rho^2 t I`` from the first place, and one more row and column with P (discrete time: G) and ``t I`` (S-procedure).
+where P is ``[[P1, 0], [P2, P3]]`` if the last errors are algebraic.  For an uncertainty R of A, ``|R| <= rho``, the
+S-procedure subtracts ``rho^2 t I`` from the first place and adds a row and a column with P (in discrete time G) and
+``t I``.
 
 References: Boyd, El Ghaoui, Feron, Balakrishnan 1994; Daafouz, Bernussou, Syst. Control Lett. 43 (2001); de Oliveira,
 Bernussou, Geromel, Syst. Control Lett. 37 (1999).
@@ -45,11 +46,11 @@ from obsynth.proofs.vertex_inequalities import Pair, Witness, pairs_of
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_polytope import ErrorPolytope
 
-#: What homogeneous problems (decay alone) are normalised by: the trace of P is at most the order times this.
+#: Homogeneous problems (decay alone) are normalised: the trace of P is at most the order times this.
 TRACE = 1.0
-#: The largest slack that is sought: more says nothing, and lets the scale of P run away.
+#: Upper bound of a maximised slack, without which the scale of P would grow without limit.
 MOST_ROOM = 1.0
-#: The same of a decay, in multiples of an earlier P: no plant in units in which it is near one decays so much faster.
+#: Upper bound of the slack of a decay in multiples of an earlier P.  In scaled units no plant decays so much faster.
 MOST_DECAY_ROOM = 1e3
 
 
@@ -76,48 +77,48 @@ def vertex_inequalities(
     errors : ErrorPolytope
         The vertices.
     goal : {"gain", "power", "decay"}, optional
-        The least l2 gain from w to z, the least mean square of z for unit white w, or the largest slack of ``decay``.
+        Minimise the l2 gain from w to z or the mean square of z for unit white w, or maximise the slack of ``decay``.
     level : float, optional
-        A given gain (or root mean square): the largest slack at that level is sought instead, which is what makes a
-        proof pass.
+        A fixed gain (or root mean square): the slack at this level is maximised instead, so that a proof has room for
+        rounding.
     decay : float, optional
-        Errors decay at least like ``decay ** k`` (discrete time) or ``exp(-decay t)`` (continuous, 1/s).
+        Errors decay at least like ``decay ** k`` (discrete time) or ``exp(-decay t)`` (continuous time, 1/s).
     lyapunov : {"common", "vertex"}, optional
-        One P, or one at each vertex (discrete time).
+        One P for all vertices, or one at each vertex (discrete time).
     steps : float, optional
-        Largest change of the weight of the second of two vertices within a sample; any by default.
+        Largest change of the weight of the second of two vertices within a sample; arbitrary by default.
     gain : {"scheduled", "constant"}, optional
-        One L at each vertex, or one for all.
+        One L at each vertex, or one L for all.
     gains : sequence of array_like, optional
-        Given gains, which are analysed.
+        Gains to be analysed.
     gain_limit : float, optional
         Largest Frobenius norm of each Y.
     free_output : bool, optional
-        Whether z may have ``V (C e + D w)`` besides, V a variable, which the innovation gives an estimate at no cost;
-        in discrete time, for the gain, with C and D constant.
+        Add ``V (C e + D w)`` with a variable V to z: an estimate may use the innovation directly.  In discrete time,
+        for the gain, with C and D constant.
     decay_metric : sequence of array_like, optional
-        P of an earlier solution, one or one at each vertex: the slack is then that of the decay alone, in multiples of
-        it, by which the next decay follows (Dinkelbach's iteration).  Needs ``decay``, and ``level`` or goal "decay".
+        P of an earlier solution, one common matrix or one at each vertex.  The slack is then that of the decay alone,
+        in multiples of this P, as in Dinkelbach's iteration.  Needs ``decay``, and ``level`` or goal "decay".
     margin : float, optional
-        What the inequalities keep to the boundary of the cone.
+        Least slack of every inequality, where the slack is not maximised.
 
     Returns
     -------
     Conditions
-        Variables ``P`` (or ``P[1]``, ...), ``G``, ``Y[1]``, ... and ``gamma_squared`` or ``mean_square``, or ``room``
-        where the level is given, and ``V``; gains ``L[1]``, ..., and ``P[1]``, ``G[1]``, ... that `witness_of` reads.
+        Variables ``P`` (or ``P[1]``, ...), ``G``, ``Y[1]``, ..., ``V``, and ``gamma_squared``, ``mean_square`` or, for
+        a fixed level, ``room`` (the slack); gains ``L[1]``, ..., and ``P[1]``, ``G[1]``, ... for `witness_of`.
 
     Raises
     ------
     SpecError
-        An option is out of range, or a scheduled gain beside an output that changes.
+        An option is out of range, or the gain is scheduled although the outputs change over the region.
 
     Examples
     --------
     >>> scalar = ErrorPolytope([[[a]] for a in (0.5, 0.9, 1.2)], [[1.0]], B=[[1.0, 0.0]], D=[[0.0, 1.0]], dt=1.0)
-    >>> found = vertex_inequalities(scalar)
-    >>> found.solve("CLARABEL", {})
-    >>> round(float(found.variables["gamma_squared"].value) ** 0.5, 5)
+    >>> conditions = vertex_inequalities(scalar)
+    >>> conditions.solve("CLARABEL", {})
+    >>> round(float(conditions.variables["gamma_squared"].value) ** 0.5, 5)
     1.56205
     """
     chosen(goal, "goal", ("gain", "power", "decay"))
@@ -132,7 +133,7 @@ def vertex_inequalities(
     forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains, free_output=free_output)
     room = cp.Variable(name="room") if level is not None or goal == "decay" else None
     slack = margin if room is None or decay_metric is not None else room
-    beside = None if decay_metric is None else _DecaySlack.of(room, decay_metric, decay, errors)
+    decay_slack = None if decay_metric is None else _DecaySlack.of(room, decay_metric, decay, errors)
     variables = forms.variables()
     value: Any = None
     if goal != "decay":
@@ -140,13 +141,14 @@ def vertex_inequalities(
         value = level**2 if level is not None else cp.Variable(nonneg=True, name=name)
         if level is None:
             variables[name] = value
+    requested = _Requested(goal, value, decay, slack, decay_slack)
     constraints: dict[str, Any] = {}
     for place, now, then in forms.places():
-        constraints |= forms.at(place, now, then, goal, value, decay, slack, beside)
+        constraints |= forms.at(place, now, then, requested)
     constraints |= {f"P{name}": lmi.at_least(P, slack) for name, P in forms.positive()}
     if room is not None:
         variables["room"] = room
-        constraints["room"] = room <= (MOST_ROOM if beside is None else MOST_DECAY_ROOM)
+        constraints["room"] = room <= (MOST_ROOM if decay_slack is None else MOST_DECAY_ROOM)
     if goal == "decay":
         constraints["trace"] = sum(cp.trace(P) for _, P in forms.positive()) <= TRACE * errors.order
     if gain_limit is not None and gains is None:
@@ -172,7 +174,7 @@ def vertex_inequalities(
 def witness_of(
     errors: ErrorPolytope, conditions: Conditions, *, steps: float | None = None
 ) -> tuple[Witness, list[FloatArray]]:
-    """Return the Lyapunov matrices and the gains of the variables' present values."""
+    """Return the Lyapunov matrices and the gains for the present values of the variables."""
     values = conditions.gains()
     by_vertex = "P[2]" in values
     P = [values[f"P[{i + 1}]"] for i in range(errors.count)] if by_vertex else [values["P"]]
@@ -216,18 +218,47 @@ def _require_fitting(
 
 
 @dataclass(frozen=True, eq=False)
+class _Requested:
+    """What every inequality requests: the goal, the squared gain or mean square, the decay, and the slack of each."""
+
+    goal: str
+    value: Any
+    decay: float | None
+    slack: Any
+    decay_slack: _DecaySlack | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Matrices:
+    """The matrices of one inequality, linear in the variables.
+
+    ``P`` at this sample, ``following`` is the third place of (V1), and ``GA``, ``GB``, ``Z``, ``Dz`` are those of the
+    error system, the first two multiplied by G'.  ``decay_slack`` is zero or a multiple of an earlier P.
+    """
+
+    P: Any
+    following: Any
+    G: Any
+    GA: Any
+    GB: Any
+    Z: Any
+    Dz: Any
+    decay_slack: Any
+
+
+@dataclass(frozen=True, eq=False)
 class _Forms:
-    """The variables of the inequalities, and the products that are linear in them."""
+    """The variables of the inequalities, and the inequalities as linear forms in them."""
 
     errors: ErrorPolytope
-    P: list[Any]  # one at each vertex, or the same everywhere
+    P: list[Any]  # at each vertex; the same object where one is common
     G: list[Any]
     Y: list[Any]
-    slack: bool
+    slack: bool  # whether G is a variable of its own
     pairs: list[Pair] | None
     fixed_gains: Sequence[FloatArray] | None
-    t: Any
-    V: Any  # of the innovation in z, or none
+    t: Any  # multiplier of the S-procedure, or None
+    V: Any  # gain from the innovation to z, or None
 
     @classmethod
     def of(
@@ -269,12 +300,12 @@ class _Forms:
         return variables | {name: part for name, part in (("t", self.t), ("V", self.V)) if part is not None}
 
     def unknown_gains(self) -> list[tuple[str, Any]]:
-        """Return the gains that are sought, with the ends of their names."""
+        """Return the variables Y with the suffixes of their names."""
         distinct = list(dict.fromkeys(self.Y))
         return [(f"[{i + 1}]", Y) for i, Y in enumerate(distinct)]
 
     def positive(self) -> list[tuple[str, Any]]:
-        """Return the matrices that must be positive definite, with the ends of their names."""
+        """Return the matrices that have to be positive definite, with the suffixes of their names."""
         k = self.errors.differential
         distinct = list(dict.fromkeys(self.P))
         if k is not None and k < self.errors.order:
@@ -282,15 +313,12 @@ class _Forms:
         return [(f"[{i + 1}]" if len(distinct) > 1 else "", P) for i, P in enumerate(distinct)]
 
     def places(self) -> list[tuple[str, FloatArray, FloatArray]]:
-        """Return name and weights, now and at the next sample, of every inequality."""
+        """Return for each inequality its suffix, the weights now, and the weights at the next sample."""
         if self.pairs is None:
             return [(f"[{i + 1}]", unit, unit) for i, unit in enumerate(np.eye(self.errors.count))]
         return [(f"[{i + 1}]", now, then) for i, (now, then) in enumerate(self.pairs)]
 
-    def at(
-        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, slack: Any,
-        beside: _DecaySlack | None,
-    ) -> dict[str, Any]:  # fmt: skip
+    def at(self, place: str, now: FloatArray, then: FloatArray, requested: _Requested) -> dict[str, Any]:
         """Return the inequalities at weights, by name."""
         errors = self.errors
         G = _mean(self.G, now)
@@ -299,78 +327,71 @@ class _Forms:
         Z, Dz = _mean(list(errors.Cz), now), _mean(list(errors.Dz), now)
         if self.V is not None:
             Z, Dz = Z + self.V @ errors.C[0], Dz + self.V @ errors.D[0]
+        decay_slack = 0.0 if requested.decay_slack is None else requested.decay_slack.at(now)
+        P_now = _mean(self.P, now)
         if errors.dt > 0.0:
-            low = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
-            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, slack,
-                                  0.0 if beside is None else beside.at(now))  # fmt: skip
-        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, slack,
-                                0.0 if beside is None else beside.at(now))  # fmt: skip
+            following = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
+            return self._discrete(place, _Matrices(P_now, following, G, GA, GB, Z, Dz, decay_slack), requested)
+        return self._continuous(place, _Matrices(P_now, P_now, G, GA, GB, Z, Dz, decay_slack), requested)
 
-    def _discrete(
-        self, place: str, P: Any, low: Any, G: Any, GA: Any, GB: Any, Z: Any, Dz: Any,
-        goal: str, value: Any, decay: float | None, slack: Any, beside: Any,
-    ) -> dict[str, Any]:  # fmt: skip
-        n, p, q = P.shape[0], Dz.shape[1], Dz.shape[0]
+    def _discrete(self, place: str, m: _Matrices, requested: _Requested) -> dict[str, Any]:
+        """Return (V1) or (V2), and the inequality of the decay, by name."""
+        n, p, q = m.P.shape[0], m.Dz.shape[1], m.Dz.shape[0]
+        value, decay, slack = requested.value, requested.decay, requested.slack
         remainder = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
         constraints = {}
-        if goal == "gain":
+        if requested.goal == "gain":
             lower = [
-                [P - remainder],
+                [m.P - remainder],
                 [np.zeros((p, n)), value * np.eye(p)],
-                [GA, GB, low],
-                [Z, Dz, np.zeros((q, n)), np.eye(q)],
+                [m.GA, m.GB, m.following],
+                [m.Z, m.Dz, np.zeros((q, n)), np.eye(q)],
             ]
-            constraints[f"(V1){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 2)), slack)
-        if goal == "power":
+            constraints[f"(V1){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, m.G, 2)), slack)
+        if requested.goal == "power":
             W = cp.Variable((p, p), symmetric=True)
-            constraints[f"(V2){place}"] = lmi.at_least(lmi.symmetric_blocks([[P - Z.T @ Z], [GA, low]]), slack)
-            constraints[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + slack <= value
-            constraints[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB, low]]), 0.0)
+            lower = [[m.P - m.Z.T @ m.Z], [m.GA, m.following]]
+            constraints[f"(V2){place}"] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
+            constraints[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(m.Dz**2)) + slack <= value
+            constraints[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [m.GB, m.following]]), 0.0)
         if decay is not None:
-            lower = [[decay**2 * P - remainder - beside], [GA, low]]
-            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 1)), slack)
+            lower = [[decay**2 * m.P - remainder - m.decay_slack], [m.GA, m.following]]
+            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, m.G, 1)), slack)
         return constraints
 
     def _with_ball(self, lower: list[list[Any]], G: Any, next_error: int) -> list[list[Any]]:
+        """Return lower blocks with the row of the S-procedure, where there is an uncertainty of A."""
         if self.t is None:
             return lower
         n = self.errors.order
         across = [G if i == next_error else np.zeros((n, row[-1].shape[0])) for i, row in enumerate(lower)]
         return [*lower, [*across, self.t * np.eye(n)]]
 
-    def _continuous(
-        self,
-        place: str,
-        P: Any,
-        GA: Any,
-        GB: Any,
-        Z: Any,
-        Dz: Any,
-        goal: str,
-        value: Any,
-        decay: float | None,
-        slack: Any,
-        beside: Any,
-    ) -> dict[str, Any]:
-        n, p = P.shape[0], Dz.shape[1]
-        rest = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
+    def _continuous(self, place: str, m: _Matrices, requested: _Requested) -> dict[str, Any]:
+        """Return (V4) or its form for the mean square, and the inequality of the decay, by name."""
+        n, p = m.P.shape[0], m.Dz.shape[1]
+        value, decay, slack = requested.value, requested.decay, requested.slack
+        remainder = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
         constraints = {}
-        if goal == "gain":
-            lower = [[-2.0 * GA - Z.T @ Z - rest], [-(GB + Z.T @ Dz).T, value * np.eye(p) - Dz.T @ Dz]]
-            constraints[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -P, 0)), slack)
-        if goal == "power":
+        if requested.goal == "gain":
+            lower = [
+                [-2.0 * m.GA - m.Z.T @ m.Z - remainder],
+                [-(m.GB + m.Z.T @ m.Dz).T, value * np.eye(p) - m.Dz.T @ m.Dz],
+            ]
+            constraints[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -m.P, 0)), slack)
+        if requested.goal == "power":
             W = cp.Variable((p, p), symmetric=True)
-            constraints[f"(V4) power{place}"] = lmi.at_least(-2.0 * GA - Z.T @ Z, slack)
-            constraints[f"(V4) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + slack <= value
-            k = self.errors.differential or P.shape[0]
-            constraints[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
+            constraints[f"(V4) power{place}"] = lmi.at_least(-2.0 * m.GA - m.Z.T @ m.Z, slack)
+            constraints[f"(V4) trace{place}"] = cp.trace(W) + float(np.sum(m.Dz**2)) + slack <= value
+            k = self.errors.differential or m.P.shape[0]
+            constraints[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [m.GB[:k], m.P[:k, :k]]]), 0.0)
         if decay is not None:
-            lower = [[-2.0 * GA - 2.0 * decay * P - rest - 2.0 * beside]]
-            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -P, 0)), slack)
+            lower = [[-2.0 * m.GA - 2.0 * decay * m.P - remainder - 2.0 * m.decay_slack]]
+            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -m.P, 0)), slack)
         return constraints
 
     def gains(self, values: Values) -> dict[str, FloatArray]:
-        """Return gains and Lyapunov matrices of the values of the variables."""
+        """Return gains and Lyapunov matrices from the values of the variables."""
         matrices: dict[str, FloatArray] = {}
         distinct = list(dict.fromkeys(self.P))
         for i, P in enumerate(distinct):
@@ -401,7 +422,7 @@ class _Forms:
 
 @dataclass(frozen=True, eq=False)
 class _DecaySlack:
-    """The slack of a decay in multiples of an earlier P."""
+    """The slack of a decay, in multiples of an earlier P."""
 
     room: Any
     metric: list[FloatArray]  # at each vertex

@@ -1,8 +1,9 @@
-"""Gains and Lyapunov matrices of a polytope of error systems that can be proved: first the least level, then a proof.
+"""Gains of an observer over a polytope, with Lyapunov matrices that prove a gain, a mean square or a decay.
 
-The P of the least level proves nothing: its inequality is singular.  A second problem fixes a level a little above and
-maximises the slack; what counts is not the solver's status but whether `obsynth.proofs.vertex_inequalities` proves it.
-Both are solved in units (powers of two, exact) in which states and levels are near one.
+A first problem finds the least level.  Its P proves nothing, since the inequality is singular there.  A second problem
+fixes a level a little above and maximises the slack.  A solution is accepted if `obsynth.proofs.vertex_inequalities`
+proves it, whatever the solver's status is.  Both problems are scaled by powers of two, without rounding, to states and
+levels near one.
 """
 
 from __future__ import annotations
@@ -26,33 +27,35 @@ from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.vertex_inequalities import VertexProof, Witness, prove_decay, prove_gain, prove_mean_square
 from obsynth.verification.error_polytope import ErrorPolytope
 
-#: How far above the least level a proof is sought, in turn; 200 of 200 random certificates passed at the first.
+#: Relative distances above the least level at which a proof is tried, in turn; 200 of 200 random certificates passed at
+#: the first one.
 ROOMS = (5e-4, 2e-3, 1e-2, 5e-2)
-#: And where none of these is proved: a claim that is some times the least one is better than none.
+#: Further distances, for the case that none of these has a proof: a large claim is better than none.
 WIDE_ROOMS = (0.2, 1.0, 4.0, 20.0, 100.0)
-#: By how much faster a decay is sought than it is proved.
+#: A requested decay enters the inequalities faster by this share, for the tolerances of the solver.
 DECAY_ROOM = 1e-3
-#: A level in other units than these is solved again in units of its own.
+#: A least level outside this range is computed again in units of the level.
 LEVEL_UNITS = (2.0**-4, 2.0**4)
-#: Solutions in units of the level found before: a level 1e-10 off is near one after the second.
+#: Most such computations; a level that is wrong by 1e-10 is near one after the second.
 MOST_RESCALINGS = 4
-#: Shares of what errors are about that count as no gain at all: where errors can be decoupled, the least level is zero
-#: but for rounding, and the first of these that is proved is shipped.
+#: Levels, relative to the size of the errors, that count as zero.  If errors can be decoupled, the least level is zero
+#: up to rounding, and the first of these levels with a proof is claimed.
 NEGLIGIBLE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-#: Shares of the distance to one by which a decay is slower than the fastest at a level, whose P proves nothing.
+#: Shares of the distance to one by which a shipped decay is slower than the fastest one, whose P proves nothing.
 DECAY_MARGINS = (0.02, 0.1, 0.3)
-#: Cubed states times vertices, and vertices, above which a decay is that of the first P: an iteration takes some five
-#: seconds there (8 states with 8 vertices, 4 with 32), and twenty with 16 states and two.
+#: Limits of cubed states times vertices, and of vertices, for the search of the fastest decay.  At the limits (8 states
+#: with 8 vertices, 4 with 32) it takes about five seconds; with 16 states and two vertices it would take twenty.
 MOST_FAST, MOST_FAST_VERTICES = 4096, 32
-#: Steps by which a decay that is not proved is made slower, towards none.
+#: Shares by which a decay without a proof is slowed down, towards no decay.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
-#: Roundings that a claimed gain covers: of its product with a bound, of the quotient that its row forms, and some more.
+#: Number of roundings that a claimed gain covers: those of its product with a bound and of the quotient in its check,
+#: and a few more.
 CLAIM_ROUNDINGS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class VertexCertificate:
-    """Gains that are proved.
+    """Gains with a proved certificate.
 
     Parameters
     ----------
@@ -61,21 +64,21 @@ class VertexCertificate:
     witness : Witness
         Lyapunov matrices.
     level : float
-        What is proved: an l2 gain or root mean square.
+        The proved l2 gain or root mean square.
     least : float
-        The least level of the first problem, not proved.
+        The least level of the first problem, without a proof.
     decay : float
         The decay that the same P proves.
     proof : VertexProof
-        Of the level.
+        The proof of the level.
     runs : tuple of mapping
         Records of the solver.
     output : FloatArray, optional
-        V of the innovation in z, where it was free.
+        V, the gain from the innovation to z, where it was free.
     is_negligible : bool
-        Whether the least level is zero but for rounding, and ``level`` one of `NEGLIGIBLE` shares.
+        Whether the least level is zero up to rounding, and ``level`` is one of the `NEGLIGIBLE` shares.
     is_fastest : bool
-        Whether about the fastest decay at the level was sought, or nothing asks for it.
+        False where the problem is too large for the search of the fastest decay.
     """
 
     gains: list[FloatArray]
@@ -90,7 +93,7 @@ class VertexCertificate:
     is_fastest: bool = True
 
     def gain_times(self, reach: float) -> float:
-        """Return the level times a bound ``reach``, which no rounding of the product and its quotient brings below."""
+        """Return the level times a bound ``reach``, rounded up so that the claim covers its own rounding errors."""
         return float(rounded_up(np.asarray(self.level * reach), CLAIM_ROUNDINGS))
 
 
@@ -117,25 +120,24 @@ def certified(
     errors : ErrorPolytope
         The vertices; with inputs w.
     goal : {"gain", "power"}, optional
-        What is made small.
+        Minimise the l2 gain or the mean square.
     level : float, optional
-        A level that is required; by default ``1 + margin`` times the least one.
+        A required level; by default ``1 + margin`` times the least one.
     margin : float, optional
         Relative distance to the least level.
     decay, lyapunov, steps, gain, gains, free_output : optional
         As for `obsynth.conditions.vertex_inequalities`.
     fast_decay : bool, optional
-        Whether gains that are sought in discrete time, without ``decay``, shall have about the fastest decay that the
-        level allows.
+        In discrete time, without ``decay``: look for gains with nearly the fastest decay that the level allows.
     solver : str, optional
-        Any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+        Any of ``cvxpy.installed_solvers()`` for semidefinite programmes.
     settings : mapping, optional
-        Its settings.
+        Settings of the solver.
 
     Raises
     ------
     SolverError
-        No certificate was found.  That proves nothing: there may be one.
+        The search found no certificate.  That is no proof that none exists.
     """
     extreme = ExtremeVertices.of(errors, gains) if lyapunov == "common" and steps is None else None
     search = _Search(
@@ -172,9 +174,9 @@ def certified(
 def certified_for_steps(
     errors: ErrorPolytope, *, steps: float | None, decay: float | None = None, **options: Any
 ) -> VertexCertificate:
-    """Return a certificate for small steps of the weights where that proves a lower level, else one for every course.
+    """Return a certificate for small steps of the weights if it proves a lower level, else one for arbitrary changes.
 
-    Neither level nor decay is worse than without the steps: these are those of one P, which is a P at each vertex too.
+    Neither level nor decay is worse than for arbitrary changes, since a common P is also a P at each vertex.
 
     Parameters
     ----------
@@ -185,12 +187,12 @@ def certified_for_steps(
     decay : float, optional
         As for `certified`.
     **options
-        The others of `certified`, but ``lyapunov``.
+        Further options of `certified`, except ``lyapunov``.
 
     Raises
     ------
     SolverError
-        No certificate was found.
+        The search found no certificate.
     """
     if steps is None:
         return certified(errors, decay=decay, **options)
@@ -202,7 +204,7 @@ def certified_for_steps(
         slow = certified(errors, decay=common.decay, lyapunov="vertex", steps=steps, **options)
     except SolverError:
         return common
-    # What is least for every course bounds what is least for slow ones.
+    # The least level for arbitrary changes is an upper bound of the least level for slow ones.
     slow = replace(slow, is_negligible=slow.is_negligible or common.is_negligible)
     return slow if slow.level < common.level else common
 
@@ -210,23 +212,23 @@ def certified_for_steps(
 def analysed(
     errors: ErrorPolytope, gains: Sequence[FloatArray], *, steps: float | None, **options: Any
 ) -> VertexCertificate:
-    """Return the lowest level that is proved of given gains: for every course, or for small steps of the weights.
+    """Return the lowest proved level of given gains, for arbitrary changes or, with ``steps``, small steps of weights.
 
     Parameters
     ----------
     errors : ErrorPolytope
         The vertices; with inputs w.
     gains : sequence of FloatArray
-        One, or one at each vertex.
+        One common gain, or one at each vertex.
     steps : float or None
         As for `certified`.
     **options
-        The others of `certified`, but ``lyapunov``.
+        Further options of `certified`, except ``lyapunov``.
 
     Raises
     ------
     SolverError
-        No certificate was found.
+        The search found no certificate.
     """
     courses: list[dict[str, Any]] = [{}] if steps is None else [{}, {"lyapunov": "vertex", "steps": steps}]
     made, failures = [], []
@@ -242,10 +244,10 @@ def analysed(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """An error system with the options under which a certificate is sought."""
+    """The search for a certificate of an error system: its options, and the records of the solver so far."""
 
     errors: ErrorPolytope
-    extreme: ExtremeVertices | None  # without them: inequalities at every vertex
+    extreme: ExtremeVertices | None  # None: inequalities at every vertex
     units: ErrorUnits
     options: dict[str, Any]
     gains: Sequence[FloatArray] | None
@@ -255,19 +257,18 @@ class _Search:
 
     @property
     def given(self) -> Sequence[FloatArray] | None:
-        """Given gains at the vertices that have an inequality."""
+        """The given gains at the vertices with an inequality."""
         return self.gains if self.extreme is None else self.extreme.given
 
     def options_with(self, decay: float | None) -> dict[str, Any]:
-        """Return the options with a little more decay: what a solver leaves of its constraints is off by its
-        tolerances."""
+        """Return the options with a slightly faster decay: solvers violate constraints by their tolerances."""
         if decay is None:
             return self.options
         room = min(decay, abs(1.0 - decay)) if self.errors.dt > 0.0 else -decay
         return {**self.options, "decay": decay - DECAY_ROOM * room}
 
     def at(self, level: float, z_unit: float, decay: float | None, least: float) -> VertexCertificate | None:
-        """Return gains with the largest slack at a level, and their certificate if it is proved."""
+        """Return the certificate with the largest slack at a level; ``None`` where it is not proved."""
         errors, units, gains, steps = self.errors, self.units, self.gains, self.options["steps"]
         moved = units.moved(z_unit)
         problem = vertex_inequalities(
@@ -278,7 +279,7 @@ class _Search:
         inner, own = witness_of(moved, problem, steps=steps)
         candidates = [own]
         if self.options["goal"] == "gain" and gains is None and _one_gain_is_enough(moved):
-            # The solver's own only where a decay needs more than the best one for the gain.
+            # Try the best gain for this P first; a decay may need the solver's own gain instead.
             candidates = [[_best_gain(moved, inner.P[0], level / z_unit)], own]
         witness = units.witness_out(inner, z_unit)
         V = problem.variables["V"].value * z_unit / units.outputs if "V" in problem.variables else None
@@ -304,9 +305,9 @@ class _Search:
 
 
 def _with_fast_decay(search: _Search, first: VertexCertificate, z_unit: float) -> VertexCertificate:
-    """Return gains of the same level with about the fastest decay that they may have, in discrete time.
+    """Return gains of the same level with nearly the fastest decay, in discrete time.
 
-    That decay is a number of the plant, whatever its coordinates; the one that comes with the largest slack is not.
+    Unlike the decay that comes with the largest slack, the fastest decay does not depend on coordinates of the plant.
     """
     errors, units = search.errors, search.units
     if errors.dt <= 0.0 or search.gains is not None or errors.ball:
