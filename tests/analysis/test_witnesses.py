@@ -1,6 +1,6 @@
-"""Unclear answers tell the tolerance, a plant within it with the other answer, and what would decide it.
+"""An unclear answer states its tolerance, a witness (a plant within it with the opposite answer), and what decides it.
 
-The witness is confirmed by deciding existence on its exact numbers: the answer there is *no*, and nothing is unclear.
+The witness is confirmed by a decision on its exact numbers: the answer for it is *no*, without any doubt.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.plants.faults import exosystem
 
-#: A last digit or two of numbers near one.
+#: The last one or two digits of numbers near one.
 LITTLE = 2.0**-51
-#: The direction (1, 1) moves at 1 (1/s, or per sample: stays) and is all but hidden.
+#: The direction (1, 1) has an eigenvalue of 1 and is hidden from the output but for rounding.
 NEARLY_HIDDEN: dict[str, Any] = {"A": [[-1.0, 2.0], [0.0, 1.0]], "C": [[1.0, -1.0 + LITTLE]]}
-#: A constant fault is answered by x = (1, 1), which the outputs all but hide.
+#: A constant fault leads to x = (1, 1), which is hidden from the outputs but for rounding.
 NEARLY_MASKED: dict[str, Any] = {
     "A": [[-1.0, -1.0], [0.5, -2.0]],
     "Bf": [[2.0], [1.5]],
@@ -75,8 +75,7 @@ def functional(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 
 def test_what_floating_point_does_not_see_is_no_refusal_of_what_shows_on_paper() -> None:
-    """With so many digits numbers are taken to be computed; they still are not those of a fault that reaches no
-    output."""
+    """Numbers with so many digits count as computed: a fault that shows only in exact arithmetic is unclear."""
     plant = made(None, **NEARLY_MASKED)
     with pytest.raises(PreconditionError, match=r"^Unclear: .*Witness: the plant with entry"):
         functional_filter(plant)

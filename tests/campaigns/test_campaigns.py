@@ -1,4 +1,4 @@
-"""A seeded share of every campaign: what the committed tables say of thousands of cases holds on these."""
+"""A seeded share of every campaign has the results that the committed tables state for thousands of cases."""
 
 import sys
 from pathlib import Path
@@ -13,16 +13,16 @@ from benchmarks.campaigns import frame  # noqa: E402
 PARTS = 4
 
 
-#: A case of these takes many seconds.
+#: Campaigns with cases that take many seconds.
 LONG = {"logs_as_they_are", "nonlinear_regions", "c_over_outliers", "switched_regions", "switched_slopes"}
-#: The parts of the others whose case takes half a second or more, where another part's takes less.
+#: Parts of the other campaigns whose cases take half a second or more.
 LONG_PARTS = {
     ("adaptive_thresholds", 1), ("adaptive_thresholds", 2), ("chain_plants", 1), ("mutated_files", 3),
     ("random_tolerances", 2), ("recursive_existence", 0), ("regions", 1), ("regions", 3), ("sentences", 2),
     ("sentences_of_pages", 0), ("sentences_of_pages", 1), ("static_and_chains", 1), ("static_and_chains", 2),
     ("static_and_chains", 3), ("tampered_claims", 0), ("tampered_claims", 3),
 }  # fmt: skip
-#: Name and part of each share.
+#: The shares: name of the campaign, and part.
 SHARES = [
     pytest.param(name, part, marks=[pytest.mark.long] * long, id=f"{name}-{part}")
     for name in frame.campaign_names()
@@ -40,7 +40,7 @@ def test_a_share_of_the_campaign(name, part, share):
     assert not wrong, wrong
 
 
-#: A campaign that was not yet run as a whole has no table.
+#: Campaigns with a table, that is those that were run as a whole.
 TABLES = [name for name in frame.campaign_names() if (Path(frame.__file__).parent / f"{name}.md").exists()]
 
 

@@ -39,8 +39,10 @@ _STATUSES = ("ok", "warm-up", "gap", "recovering", "out")
 
 
 def random_plant(seed: int) -> PolytopicSystem:
-    """Return a stable plant of two to four states, the last of which may be algebraic, with texts in its parameters,
-    rates, or the weights of its vertices as parameters."""
+    """Return a stable plant of two to four states, the last of which may be algebraic.
+
+    Its entries are expressions of parameters, with or without rates, or the weights of its vertices are the parameters.
+    """
     rng = np.random.default_rng([seed, 51])
     n, algebraic, kind = int(rng.integers(2, 5)), bool(rng.integers(0, 2)), seed % 3
     middle = rng.standard_normal((n, n))
@@ -68,7 +70,8 @@ def random_plant(seed: int) -> PolytopicSystem:
 
 
 def rows_of(design: ObserverDesign, seed: int, count: int) -> FloatArray:
-    """Return random rows with blank cells, at the start too, and parameters outside, missing and too fast."""
+    """Return random rows with blank cells, also at the start, and with parameters outside the region, missing or too
+    fast."""
     plant, rng = design.scheduled[0], np.random.default_rng(seed)
     held, nu = plant.scheduling, plant.nu
     p = len(held.names)
@@ -86,7 +89,7 @@ def rows_of(design: ObserverDesign, seed: int, count: int) -> FloatArray:
 
 
 def in_c(design: ObserverDesign, folder: Path, rows: FloatArray, more: str = "", **options: Any) -> FloatArray:
-    """Return what C says of rows: status, alarm, estimates, and ``more`` that is printed."""
+    """Return the output of the C code for each row: status, alarm, estimates, and what ``more`` prints."""
     observer = design.scheduled[1]
     obsynth.export(design, folder / "region.c", **options)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
@@ -148,7 +151,7 @@ def watched_plant(seed: int) -> PolytopicSystem:
 def test_guaranteed_thresholds_in_c_follow_the_rows_as_in_a_run(
     seed: int, h: float, initial_error: float | None, warm_up: float | None, tmp_path: Path
 ) -> None:
-    """Norm and threshold of every row, through gaps and rows outside, and after rows outside from the start again."""
+    """C has the norm and the threshold of a run in every row, in gaps, and after rows outside the region."""
     design = obsynth.ui_pi_observer(watched_plant(seed))
     bounds = dict.fromkeys(design.plant.disturbance_names, 0.1)
     monitor = obsynth.online_monitor(design, disturbance_bounds=bounds, noise_bound=3, initial_error=initial_error)

@@ -32,7 +32,7 @@ def sections() -> dict[str, type]:
     return {kind.__name__: kind for kind in kinds if issubclass(kind, schema_values.Section) and kind.model_fields}
 
 
-#: Sections with one key, which stand in the types of others.
+#: Sections with a single key, which the reference explains within other sections.
 WITHIN_OTHERS = {"NamesFile", "OutputPick", "StatePick"}
 
 

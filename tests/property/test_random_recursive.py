@@ -16,7 +16,7 @@ MODES = (0.5, 0.99, 1.0, -1.0, 1.05, 3.0)
 
 
 class Case(NamedTuple):
-    """Matrices in random coordinates; the mode in the last dynamic state shows in no output."""
+    """Matrices in random coordinates, with an unobservable mode in the last dynamic state."""
 
     E: np.ndarray
     A: np.ndarray
@@ -72,7 +72,7 @@ def test_detectability_decides(seed: int, mode: float) -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("seed", range(6))
 def test_of_plants_that_change_the_product_decides(seed: int, mode: float) -> None:
-    """The same matrices as a stack, in units far apart: a hidden mode that stays is not taken for one that decays."""
+    """The same matrices as a stack, in very different units: a hidden mode that does not decay is recognised."""
     found = case(seed, mode)
     plant = TimeVaryingDescriptorSystem(found.E, np.tile(found.A, (STEPS, 1, 1)), C=found.C, dt=1.0)
     if abs(mode) < 1.0:
@@ -86,7 +86,7 @@ def test_of_plants_that_change_the_product_decides(seed: int, mode: float) -> No
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(12))
 def test_as_many_parameters_as_outputs_and_not_one_more(seed: int) -> None:
-    """At rest, ny outputs hold ny numbers: so many random parameters show, and the last may be made to hide."""
+    """At rest ny outputs determine ny random parameters, unless the last one is made to cancel the others."""
     found = case(seed, 0.5)
     design = obsynth.adaptive_observer(found.plant(parameters=True), Q=found.Q, R=found.R, window=20)
     assert design.report.passed
@@ -104,7 +104,7 @@ def test_as_many_parameters_as_outputs_and_not_one_more(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_numeric_test_of_plants_that_change_agrees(seed: int) -> None:
-    """The same matrices as stacks: what acts on nothing is found by its traces, what acts is not refused."""
+    """The same matrices as stacks: parameters without effect are found by their traces, the others are accepted."""
     found = case(seed, 0.5)
     stacked = TimeVaryingDescriptorSystem(
         found.E, np.tile(found.A, (STEPS, 1, 1)), C=found.C, Phi=found.Phi, Psi=found.Psi, dt=1.0

@@ -1,4 +1,4 @@
-"""Random plants in random units: the same verdict, the same observer in the other time, and it passes."""
+"""Random plants in random units of signals and time: the same verdict and, in these units, the same observer."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from obsynth import DescriptorSystem, ObserverDesign, PreconditionError, ui_pi_o
 from obsynth.numerics.spectra import spectrum_error
 
 BATCHES, SIZE = 3, 20
-#: Poles may differ by this, relative to their size, or else by this many times what rounding the data moves them.
+#: Poles may differ by this, relative to their size, or by this multiple of the effect of rounding the data.
 SAME, ROUNDINGS = 1e-6, 100.0
 
 
 @dataclass(frozen=True)
 class Rescaled:
-    """The plant of a case in other units; ``rate`` turns its rates into those of the case."""
+    """A case in other units; ``time`` is the factor of its rates."""
 
     case: Case
     time: float
 
 
 def in_other_units(case: Case, seed: int) -> Rescaled:
-    """States, equations, outputs, faults and disturbances by 1e-3 to 1e3, time by 1e-9 to 1e6."""
+    """Return a case with states, equations and signals scaled by 1e-3 to 1e3, and time by 1e-9 to 1e6."""
     rng = np.random.default_rng([7, seed])
     plant = case.plant
 
@@ -51,7 +51,7 @@ def in_other_units(case: Case, seed: int) -> Rescaled:
 
 
 def outcome(case: Case, **options: object) -> ObserverDesign | PreconditionError:
-    """Any other error, and any warning, fails the test."""
+    """Return the design or its refusal; any other error, and any warning, fails the test."""
     try:
         return ui_pi_observer(case.plant, fault_model=case.model, **options)
     except PreconditionError as error:
@@ -59,7 +59,7 @@ def outcome(case: Case, **options: object) -> ObserverDesign | PreconditionError
 
 
 def moved_by_rounding(case: Case, poles: np.ndarray) -> float:
-    """Return how far the poles go when the data change in the last digits: clusters near zero go far."""
+    """Return how far the poles move when the data change in the last digits: poles in clusters near zero move far."""
     rng = np.random.default_rng(1)
     changed = case.plant.replace(A=case.plant.A * (1.0 + 1e-15 * rng.standard_normal(case.plant.A.shape)))
     return spectrum_error(ui_pi_observer(changed, fault_model=case.model).observer.Az, poles, case.plant.dt)

@@ -15,7 +15,7 @@ from obsynth.report.summary import summary
 SOURCE = Path(obsynth.__file__).parent
 DESIGNS = Path(__file__).parents[2] / "designs"
 
-#: Parts of sentences that have better ones.
+#: Phrases that readers did not understand, and that have been replaced.
 UNCLEAR = (
     "what the estimate never exceeds",
     "the bound, divided by the least of all tests",
@@ -52,12 +52,12 @@ UNCLEAR = (
 
 
 def texts_of(tree: ast.Module) -> list[tuple[int, str]]:
-    """Return the texts of a module with their lines, but for docstrings."""
-    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    """Return the texts of a module with their lines, without docstrings."""
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     return [
         (node.lineno, node.value)
         for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
     ]
 
 

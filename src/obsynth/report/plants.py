@@ -1,4 +1,4 @@
-"""A plant for people: its structure, what can be diagnosed on it, which methods can serve it, its matrices as text."""
+"""Printed reports on a plant: its structure, its diagnosable faults, the methods that exist for it, its matrices."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.diagnosis.verdicts import Diagnosis
 
 
-#: Of a bank of residuals so many rows are shown.
+#: Most printed rows of a bank of residuals.
 MOST_BANK_ROWS = 12
 
-#: What the columns of numbers mean.
+#: Explanation of the columns in the table of faults.
 _COLUMN_MEANINGS = (
     "detectable: some residual responds to the fault; steady state: also to a constant one. as a step, any signal: the "
     "fault can be estimated if it is a step, or whatever its time course. delay: samples, or derivatives of the "
@@ -49,7 +49,7 @@ _COLUMN_MEANINGS = (
     "estimates the fault."
 )
 
-#: Conditions that ask for another time than the plant's, and what to do about each.
+#: Conditions that a plant is continuous, or discrete, with the remedy for each.
 _TIME_CONDITIONS = {
     "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
     "and sample the observer afterwards (obsynth.sample_observer)",
@@ -57,10 +57,11 @@ _TIME_CONDITIONS = {
     "obsynth.discretise in Python)",
 }
 
-#: Conditions on what a spec says, which the plant cannot fail.
-_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
+#: Conditions on options, which do not depend on the plant.
+_OPTION_CONDITIONS = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
 
-#: The row that a certificate covers a region, and the method of nonlinear plants whose conditions are those at points.
+#: Name of the condition that one certificate covers a region, and the id of the method whose conditions are decided at
+#: points of a region only.
 _OVER_REGION, _REGION_OBSERVER = f"exists: {REGION_CONDITION}", "region-observer"
 
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
@@ -69,7 +70,7 @@ _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "di
 
 
 def plain_table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> Iterator[tuple[str, str]]:
-    """Yield the lines of a table; long names are cut, and the last column takes what is left."""
+    """Yield the lines of a table with their styles; the first and the last column are cut to fit the width."""
     columns = [aligned([row[i] for row in rows]) for i in range(len(headings))]
     rows = list(zip(*columns, strict=True))
     widths = [max(len(row[i]) for row in (headings, *rows)) for i in range(len(headings))]
@@ -96,7 +97,7 @@ def check_report(
     console: Console,
     transformation: str = "",
 ) -> None:
-    """Print the structure of a plant, and for each method whether it can serve this plant."""
+    """Print the structure of a plant, and for each method whether it exists for this plant."""
     facts = list(plant_facts(plant))
     if transformation:
         facts.insert(0, ("transformed", transformation))
@@ -123,14 +124,14 @@ def _existence_line(method: str, report: VerificationReport, *, over_region: boo
     if report.passed:
         return Text(f"{method}: {_all_hold(report, over_region)}.", style="green")
     failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
-    if {check.name for check in report.failures} & _ASKED:
+    if {check.name for check in report.failures} & _OPTION_CONDITIONS:
         return Text(f"{method}: needs more options: {failed}.", style="yellow")
     verdict, style = _verdict(report.failures)
     return Text(f"{method}: {verdict}: {failed}.", style=style)
 
 
 def is_unclear(failed: Sequence[Check]) -> bool:
-    """Whether all conditions that do not hold are undecided."""
+    """Whether double precision could not decide any of the conditions that do not hold."""
     return bool(failed) and all(check.unclear for check in failed)
 
 
@@ -144,7 +145,7 @@ def _verdict(failed: Sequence[Check]) -> tuple[str, str]:
 
 
 def structure_facts(structure: Structure) -> dict[str, str]:
-    """Return the facts about a plant's structure."""
+    """Return the structure of a plant as labels and texts."""
     blocks = [f"{size}" for size in structure.infinite_block_sizes]
     return {
         "pencil A - zE": "regular" if structure.regular else "NOT regular",
@@ -170,7 +171,7 @@ def _yes(value: bool) -> str:
 
 
 def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
-    """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
+    """Print the verdicts on all faults with their sentences; with ``everything`` isolability and residuals as well."""
     if not diagnosis.faults:
         return
     print_section(console, diagnosis.heading, _rich_table(diagnosis.verdict_rows()))
@@ -198,7 +199,7 @@ def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
     table = headed_table(*rows[0])
     for column, (heading, *cells) in zip(table.columns, zip(*rows, strict=True), strict=True):
         column.overflow = "fold"
-        # A column that cannot fold must not be narrowed: the last columns would be cut off.
+        # Columns of single words must keep their width, or rich cuts off the last columns.
         column.no_wrap = " " not in heading and all(len(cell) <= len(heading) for cell in cells)
     for row in rows[1:]:
         table.add_row(*(Text(text) for text in row))
@@ -206,7 +207,7 @@ def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
 
 
 def _all_hold(report: VerificationReport, over_region: bool) -> str:
-    """Return in words what follows where all conditions hold."""
+    """Return the conclusion of a report in which all conditions hold, in words."""
     if not over_region:
         return "all conditions hold, so a design exists"
     row = next((check for check in report.checks if check.name == _OVER_REGION), None)
@@ -221,7 +222,7 @@ def _all_hold(report: VerificationReport, over_region: bool) -> str:
 def method_lines(
     methods: Mapping[str, VerificationReport], *, own: str = "", over_region: bool = False
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield method, verdict in words and style; methods for other kinds of plants come last, in one line."""
+    """Yield each method with its verdict and a style; methods for other kinds of plants share one last line."""
     others = []
     for method, report in methods.items():
         failed = report.failures
@@ -240,8 +241,8 @@ def method_lines(
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
             reason = reason.replace("The plant", "the plant", 1) if reason.startswith("The plant") else reason
             yield method, f"not for this plant{own_method}: {reason}".rstrip("."), "yellow"
-        elif names & _ASKED:
-            reason = " ".join(check.detail for check in failed if check.name in _ASKED)
+        elif names & _OPTION_CONDITIONS:
+            reason = " ".join(check.detail for check in failed if check.name in _OPTION_CONDITIONS)
             yield method, f"needs more options{own_method}: {reason}".rstrip("."), "yellow"
         else:
             verdict, style = _verdict(failed)
@@ -251,7 +252,7 @@ def method_lines(
 
 
 def methods_text(methods: Mapping[str, VerificationReport]) -> str:
-    """Return what ``print(obsynth.check(plant))`` shows."""
+    """Return the text of ``print(obsynth.check(plant))``."""
     over_region = any(_OVER_REGION in {check.name for check in report.checks} for report in methods.values())
     return printed(lambda console: print_methods(methods, own="", over_region=over_region, console=console))
 
@@ -259,7 +260,7 @@ def methods_text(methods: Mapping[str, VerificationReport]) -> str:
 def print_methods(
     methods: Mapping[str, VerificationReport], *, own: str, over_region: bool = False, console: Console
 ) -> None:
-    """Print the lines of all methods."""
+    """Print the verdict on each method."""
     for method, text, style in method_lines(methods, own=own, over_region=over_region):
         lines = textwrap.wrap(
             f"{method}: {text}", min(console.width, 120), subsequent_indent="  ", break_on_hyphens=False
@@ -282,7 +283,7 @@ def _reason(failed: Sequence[Check]) -> str:
 
 
 def linear_plant_text(plant: DescriptorSystem) -> str:
-    """Return operating point and matrices, each with its signals."""
+    """Return operating point and matrices as text, with the signals of the columns."""
     lines = ["Operating point:"]
     for name, value in plant.operating_point.items():
         unit = plant.units.get(name, "1")
@@ -304,7 +305,7 @@ def linear_plant_text(plant: DescriptorSystem) -> str:
 
 
 def plant_document(plant: DescriptorSystem, source: str) -> str:
-    """Return the plant as YAML that a spec can name; every number as exact as it is."""
+    """Return the plant as a YAML document that a spec can refer to, with all digits of its numbers."""
     data: dict[str, Any] = {"schema_version": 1, "dt": float(plant.dt)}
     for name in PLANT_MATRICES:
         matrix = getattr(plant, name)

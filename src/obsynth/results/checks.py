@@ -1,4 +1,4 @@
-"""The rows of a verification report: the claim, the recomputed number, and whether it holds."""
+"""Checks, the rows of a verification report: each has a claim, a recomputed number, a bound and a verdict."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ CheckKind = Literal["proved", "equality", "computed", "condition", "information"
 
 Status = Literal["proved", "recomputed", "estimated", "assumed"]
 
-#: The check without which observer and plant say nothing of one another.
+#: Name of the check that an observer belongs to its plant; without it no other check has a meaning.
 FITS = "fits the plant"
 
-#: The row of a design that is a model without feedback; the verdict begins with it.
+#: Name of the row of a design that is a model without feedback; the verdict begins with it.
 OPEN_LOOP = "open-loop model"
 
 
@@ -27,31 +27,31 @@ class Check:
     name : str
         Short name, unique in the report.
     claim : str
-        What is claimed, in words.
+        The claim, in words.
     value : float
-        The number recomputed from the plant and the shipped realisation.
+        The number recomputed from the plant and the stored observer.
     bound : float
-        What the number is compared with.
+        The bound that the number is compared with.
     margin : float
-        How far the number is on the right side of the bound (negative when the check fails).
+        Distance of the number from the bound, negative when the check fails.
     passed : bool
         The verdict.
     source : str
-        Where the claim comes from: paper and equation, or our own finding.
+        Source of the claim: paper and equation, or a result of obsynth.
     kind : str
         ``proved`` (an inequality, rounding errors bounded), ``equality`` (a residual against a bound
         scaled by the data: never called proved), ``computed`` (a number found by a second route),
         ``condition`` (an existence condition) or ``information`` (never fails).
     detail : str, optional
-        One more sentence for the reader.
+        A further sentence for the reader.
     status : str, optional
-        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``recomputed`` (double
+        How far the row can be trusted: ``proved`` (outward rounding, on the stored numbers), ``recomputed`` (double
         precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
-        ``interval``) or ``assumed`` (stated in the gain set, and not checked).  That of the kind by default.
+        ``interval``) or ``assumed`` (stated in the gain set, and not checked).  By default it follows from ``kind``.
     interval : tuple of float, optional
-        Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
+        Confidence interval of an estimate, with the probability that ``detail`` states.
     unclear : bool, optional
-        Of a condition that does not hold: whether double precision could not decide it.
+        For a condition that does not hold: double precision could not decide it.
     of_the_method : bool, optional
         Of a condition that does not hold: whether the method alone needs it.  It does not take the plant as it is, and
         nothing is said of other observers.
@@ -102,12 +102,12 @@ def upper_bound_check(
 def fitting_check(
     claim: str, *, fits: bool, source: str = "shipped realisation", kind: CheckKind = "computed", detail: str = ""
 ) -> Check:
-    """Return the check `FITS`, that what is shipped belongs to the plant."""
+    """Return the check `FITS`: the stored observer and its certificate belong to the plant."""
     return upper_bound_check(FITS, claim, float(not fits), 0.0, source=source, kind=kind, detail=detail)
 
 
 def nothing_wrong(name: str, claim: str, wrong: Sequence[Any], *, source: str) -> Check:
-    """Return a check that passes where nothing is wrong; its detail says what is."""
+    """Return a check that passes if the list ``wrong`` is empty; otherwise its detail shows the list."""
     detail = f"wrong: {', '.join(map(str, wrong))}" if wrong else ""
     return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=source, detail=detail)
 
@@ -140,6 +140,6 @@ def information(
 
 
 def all_hold(checks: Sequence[Check]) -> bool:
-    """Return whether there is at least one real check and all of them hold."""
+    """Whether there is at least one check besides information, and all of these pass."""
     verdicts = [check.passed for check in checks if check.kind != "information"]
     return bool(verdicts) and all(verdicts)

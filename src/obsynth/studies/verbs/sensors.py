@@ -1,4 +1,4 @@
-"""The verb ``sensors``: least sets of sensors to add."""
+"""The verb ``sensors``: smallest sets of sensors to add to a plant."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from obsynth.report.terminal.stages import progress
 
 
 def run_sensors(options: argparse.Namespace) -> int:
-    """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
+    """Run ``sensors``: print the smallest sets of sensors that reach a goal; raise an error where none does."""
     from obsynth.specs.loader import load_spec
     from obsynth.studies.sensor_sets import sensor_sets
 

@@ -1,4 +1,4 @@
-"""The verb ``sweep``, and ``run`` for many gain sets: many cases in, one table and one picture out."""
+"""The verb ``sweep``, and ``run`` for a folder of gain sets: one table and one picture of many cases."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from obsynth.specs.documents import read_yaml
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
 
-#: More designs than these are made on all processors: a process takes as long to begin as several small designs.
+#: With more designs a sweep uses all processors; starting a process takes as long as several small designs.
 FEW_DESIGNS = 10
 
-#: Windows waits for no more processes at once.
+#: Limit of Windows on the processes of an executor.
 MOST_PROCESSES = 61
 
-#: Blanks between columns.
+#: Number of blanks between columns.
 _BLANKS_BETWEEN = 2
 
 
 def run_sweep(options: argparse.Namespace) -> int:
-    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to, 2 when all are malformed."""
+    """Run ``sweep``; the exit code is 2 if all cases are malformed, else 0, whatever the results are."""
     from obsynth.studies.sweep import sweep
     from obsynth.studies.work import WORK_STATUSES
 
@@ -47,7 +47,7 @@ def run_sweep(options: argparse.Namespace) -> int:
     if len(parameters) < len(listed):
         raise SpecError("Two lists of values (--set) are of the same entry: put them into one.", path="--set")
     for spec in options.system:
-        input_file(Path(spec))  # what is designed for hours is not refused in the end
+        input_file(Path(spec))  # an output that would overwrite it is refused now, and not after hours of work
     _require_claim(options, parameters)
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
@@ -75,13 +75,13 @@ def run_sweep(options: argparse.Namespace) -> int:
 
 
 def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> None:
-    """Refuse a claim that no method of a sweep can make before anything is designed."""
+    """Raise `SpecError` for a claim that no method of a sweep makes, before anything is designed."""
     if options.claim is None:
         return
     methods = list(parameters.get("method.id", ()))
     for section in parameters.get("method", [read_yaml(Path(spec)).get("method") for spec in options.system]):
         methods.append(section.get("id") if isinstance(section, dict) else None)
-    # What chooses its method may come to any.
+    # Where a case chooses its method itself, all methods are possible.
     known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
     claims = sorted({claim for method in known for claim in method_class(method).claims})
     if options.claim not in claims:
@@ -92,7 +92,7 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
 
 
 def run_many(options: argparse.Namespace) -> int:
-    """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
+    """Run ``run`` for a folder of gain sets: write a table, a picture, and the estimates of each design on each log."""
     from obsynth.studies.fleet import run_fleet
 
     alone = ("system", "state", "prove", "smooth", "lag")
@@ -111,7 +111,7 @@ def run_many(options: argparse.Namespace) -> int:
 
     for path in (Path(options.gains), Path(options.data)):
         if path.is_file():
-            input_file(path)  # what is read is never written, by force or not
+            input_file(path)  # registered, so that no output overwrites it, not even with --force
     settings = {
         "columns": dict(options.map) or None,
         "time_column": options.time_column,
@@ -157,7 +157,7 @@ def _carried_out(
     *,
     jobs: int | None,
 ) -> tuple[Any, tuple[Path, ...]]:
-    """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
+    """Return the result of ``work``, and the files of its table and picture; after an error no new folder is left."""
     unit, kind, picture_name = named
     with made_folder(folder):
         table = output_file(folder / "table.csv", kind, options)
@@ -188,7 +188,7 @@ def _print_outcome(options: argparse.Namespace, outcome: Any, files: tuple[Path,
 
 
 def _first_failures(cases: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """Return for each kind of failure the first case, its status and why it has no design."""
+    """Return the first case of each kind of failure, with its status and the reason."""
     firsts: dict[str, tuple[str, str, str]] = {}
     for case in cases:
         if case["message"]:
@@ -197,20 +197,20 @@ def _first_failures(cases: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, 
 
 
 def usual_jobs(count: int) -> int:
-    """Return on how many processes so many designs are made where nothing is said: one, or one a processor for many."""
+    """Return the default number of processes for ``count`` designs: one for few, else one for each processor."""
     return 1 if count <= FEW_DESIGNS else min(usable_processors(), MOST_PROCESSES)
 
 
 def usable_processors() -> int:
     """Return how many processors this process may use."""
-    # Not on every platform.
+    # sched_getaffinity does not exist on every platform.
     allowed = getattr(os, "sched_getaffinity", None)
     return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
 @contextmanager
 def chosen_executor(jobs: int | None, cluster: str | None) -> Iterator[Executor | None]:
-    """Yield where work goes: nowhere else, processes, or a Dask cluster."""
+    """Yield the executor of the work: `None` for this process, a pool of processes, or a Dask cluster."""
     if jobs is not None and cluster is not None:
         raise SpecError("--jobs and --cluster are two places for the work: give one of them.", path="--jobs")
     if cluster is not None:
@@ -270,7 +270,7 @@ def _png_of(plot: Callable[[], Any]) -> bytes | None:
 
 
 def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
-    """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
+    """Return a printed table, below a line of counts, the columns that are equal in all rows, and the omitted ones."""
     from rich.console import Group
     from rich.text import Text
 
@@ -288,7 +288,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
     )
     for name, column in filled.items():
         if name not in same:
-            # Texts fold at blanks; a number that is cut is another number.
+            # Texts fold at blanks, so a column needs the width of its longest word; a cut number would be wrong.
             words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
             wide = max(map(len, words)) + _BLANKS_BETWEEN
             if wide <= room:
@@ -302,7 +302,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
         lines.append(f"In table.csv alone: {', '.join(missing)}.")
     table = headed_table(*(name.replace(".", ". ") for name in printed))
     for place, (name, cells) in zip(table.columns, printed.items(), strict=True):
-        # What room is left goes to the first texts that could use it.
+        # Remaining space goes to the first columns whose texts are longer.
         more = min(max(map(len, cells)) - widths[name], room)
         place.width, room = widths[name] + max(more, 0), room - max(more, 0)
     for row in zip(*printed.values(), strict=True):
@@ -311,7 +311,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
 
 
 def _printed_cases(outcome: Any, width: int) -> Any:
-    """Return the table of a sweep for people: without message and file."""
+    """Return the printed table of a sweep, without the columns message and file."""
     from obsynth.results.layout import bound_number
 
     header, rows = outcome.rows()
@@ -325,7 +325,7 @@ def _printed_cases(outcome: Any, width: int) -> Any:
 
 
 def _printed_runs(outcome: Any, width: int) -> Any:
-    """Return the table of runs for people: the first alarm of each, and why one was not made."""
+    """Return the printed table of runs, with the first alarm of each, or the reason why it has no result."""
     rows = []
     for run in outcome.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
