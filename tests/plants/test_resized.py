@@ -66,3 +66,39 @@ def test_what_has_entries_is_not_resized() -> None:
 
 def test_faults_of_sensors_are_added_to_those_of_the_dynamics() -> None:
     assert PLANT.replace(Df=["y2"]).fault_names == ("f1", "y2")
+
+
+NOISY = obsynth.DescriptorSystem(
+    A=-np.eye(2), C=np.eye(2), Bf=[[1], [0]], Bw=[[0.1], [0.0]], Dw=[[0.0], [0.3]],
+    noise_names=["wind"], output_names=["speed", "angle"], sensor_noise={"speed": 0.1, "angle": 0.2},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("stated", "names", "Dw"),
+    [
+        ({"speed": 0.5}, ("wind", "noise angle", "noise speed"), [[0.0, 0.0, 0.5], [0.3, 0.2, 0.0]]),
+        ({"angle": 0.5, "speed": 0.4}, ("wind", "noise angle", "noise speed"), [[0.0, 0.0, 0.4], [0.3, 0.5, 0.0]]),
+        (None, ("wind",), [[0.0], [0.3]]),
+    ],
+)
+def test_noise_of_sensors_takes_the_place_of_what_was_stated_of_them(stated, names, Dw) -> None:
+    plant = NOISY.replace(sensor_noise=stated)
+    assert plant.noise_names == names
+    np.testing.assert_array_equal(plant.Dw, Dw)
+    np.testing.assert_array_equal(plant.Bw[:, 0], [0.1, 0.0])
+    assert not plant.Bw[:, 1:].any()
+
+
+def test_noise_with_a_colour_takes_the_place_of_the_white_one() -> None:
+    made, _ = obsynth.with_noise(NOISY, sensor_noise={"speed": {"deviation": 0.1, "correlation": 2.0}})
+    new = made.plant
+    assert new.noise_names.count("noise speed") == 1
+    white = new.Dw[0, new.noise_names.index("noise speed")]
+    assert white == pytest.approx(0.001)  # a hundredth beside it, and no longer 0.1
+    assert new.Dw[1, new.noise_names.index("noise angle")] == 0.2
+
+
+def test_names_of_sensor_noise_follow_other_columns() -> None:
+    plant = PLANT.replace(sensor_noise={"y1": 0.1, "y2": 0.2}).replace(Dw=[[0.5], [0.0]])
+    assert plant.noise_names == ("w1",)

@@ -18,7 +18,7 @@ from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, exact_numbers
 from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES, MatrixOrNames, plant_fields
 from obsynth.plants.other_names import ELSEWHERE, plant_keywords_suggested
-from obsynth.plants.resized import with_what_follows
+from obsynth.plants.resized import with_what_follows, without_sensor_noise
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
 #: Larger plants as written are not stored with a design: their elimination is checked where it is done.
@@ -272,7 +272,8 @@ class DescriptorSystem:
         Tolerances and exact numbers are those of the matrices as they were: with a change of one of these they are
         not carried over, and whatever would use tolerances refuses (``uncertainty=None`` says that the model is exact).
         Units and other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
-        Matrices without entries, E = I and names such as u1, u2 follow the sizes of the changed matrices.
+        Matrices without entries, E = I and names such as u1, u2 follow the sizes of the changed matrices.  Noise that
+        ``sensor_noise`` states takes the place of what it stated of the same outputs before; `None` removes all of it.
 
         Parameters
         ----------
@@ -281,6 +282,7 @@ class DescriptorSystem:
         """
         arguments = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
         changes = with_what_follows(arguments, changes)
+        arguments |= without_sensor_noise(arguments, changes)
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
         gone -= {
             name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else arguments[field])

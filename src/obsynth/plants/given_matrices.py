@@ -61,6 +61,9 @@ MatrixOrNames = ArrayLike | Sequence[str] | None
 
 SIGNAL_NAMES = tuple(SIGNAL_FIELDS.values())
 
+#: How the names of noises begin that ``sensor_noise`` states; the output follows.
+SENSOR_NOISE = "noise "
+
 ALL_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
 
@@ -299,4 +302,4 @@ def _noise_of_sensors(
             # Its own message is enough.
             return ()
         fields[name] = np.hstack([matrix, more])
-    return tuple(f"noise {name}" for name in sensor_noise)
+    return tuple(f"{SENSOR_NOISE}{name}" for name in sensor_noise)

@@ -1,4 +1,4 @@
-"""What follows when matrices of a plant are replaced by others of another size: zeros, the identity, numbered names."""
+"""What follows when matrices of a plant are replaced: zeros, the identity, numbered names, and earlier sensor noise."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.sparse import is_sparse, same_matrix
+from obsynth.numerics.sparse import dense, is_sparse, same_matrix
 from obsynth.plants.checking import COUNTED_BY
-from obsynth.plants.given_matrices import MATRIX_LAYOUT, SENSOR_PICKS, SIGNAL_FIELDS
+from obsynth.plants.given_matrices import MATRIX_LAYOUT, SENSOR_NOISE, SENSOR_PICKS, SIGNAL_FIELDS
 from obsynth.plants.signal_names import is_name_list
 
 
@@ -29,9 +29,30 @@ def with_what_follows(arguments: Mapping[str, Any], changes: Mapping[str, Any]) 
                 following[name] = np.zeros((new[rows], new[columns]))
     for letter, field in SIGNAL_FIELDS.items():
         numbered = tuple(f"{letter}{i + 1}" for i in range(old[letter]))
-        if field not in changes and new[letter] != old[letter] and (arguments[field] == numbered or not new[letter]):
+        own = letter == "w" and arguments[field] and all(name.startswith(SENSOR_NOISE) for name in arguments[field])
+        made = arguments[field] == numbered or own
+        if field not in changes and new[letter] != old[letter] and (made or not new[letter]):
             following[field] = None
     return {**changes, **following}
+
+
+def without_sensor_noise(arguments: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return Bw, Dw and their names without the noise that ``sensor_noise`` states anew; `None` states that of none.
+
+    ``arguments``: what the plant was made of.  Columns that drive equations or several outputs, too, stay.
+    """
+    if "sensor_noise" not in changes or {"Bw", "Dw", "noise_names"} & set(changes):
+        return {}
+    stated = changes["sensor_noise"]
+    names, outputs = arguments["noise_names"], arguments["output_names"]
+    Bw, Dw = dense(arguments["Bw"]), dense(arguments["Dw"])
+    kept = []
+    for column, name in enumerate(names):
+        output = name.removeprefix(SENSOR_NOISE)
+        own = [outputs[row] for row in np.flatnonzero(Dw[:, column])] == [output] and not Bw[:, column].any()
+        if not (own and name != output and (stated is None or output in stated)):
+            kept.append(column)
+    return {"Bw": Bw[:, kept], "Dw": Dw[:, kept], "noise_names": [names[column] for column in kept]}
 
 
 def _sizes_of(arguments: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, int]:
