@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import cache
 from typing import Any
 
@@ -194,6 +195,21 @@ def test_errors_of_any_start_decay_beside_a_mode_that_grows() -> None:
     y = 1e-3 * 1.3 ** np.arange(80.0)[:, None] * plant.C[:, 0]
     faults = np.abs(design.observer.run(y).faults)
     assert faults[-1, 0] < 1e-5 * np.max(faults) < 1e-7 * np.max(y)
+
+
+@pytest.mark.parametrize(("mode", "dt"), [(-1.05, 1.0), pytest.param(0.3, 0.0, marks=pytest.mark.long)])
+def test_the_least_gain_of_filters_whose_errors_decay_is_printed_beside_a_mode_that_grows(
+    mode: float, dt: float
+) -> None:
+    """No noise drives it, so that the bound is also of filters that ignore it."""
+    plant, options = growing(mode, dt), {"delay": 1} if dt else {"reference": {"bandwidth": 0.2}}
+    design = obsynth.optimal_filter(plant, **options)
+    printed = float(re.search(r"decay after any start is about ([\d.]+) ", design.notes[-1])[1])
+    driven = plant.replace(Bw=np.hstack([np.zeros((2, 3)), [[1e-4], [0.0]]]), Dw=np.eye(3, 4), noise_names=[*"abcd"])
+    limit = obsynth.optimal_filter(driven, **options)
+    assert printed == pytest.approx(limit.least, rel=2e-6)
+    assert design.least < 0.9 * printed
+    assert printed * (1 - 2e-6) <= design.gain <= 1.001 * printed
 
 
 @pytest.mark.long

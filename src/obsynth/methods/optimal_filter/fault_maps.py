@@ -13,7 +13,11 @@ import numpy as np
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.optimal_filter.delays import delays_of
-from obsynth.methods.optimal_filter.lasting_modes import with_growing_modes_reached, with_lasting_modes_driven
+from obsynth.methods.optimal_filter.lasting_modes import (
+    ADDED_DRIVES,
+    with_growing_modes_reached,
+    with_lasting_modes_driven,
+)
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
@@ -429,3 +433,13 @@ def least_deviation_of_every_start(plant: DescriptorSystem, fault_map: FaultMap,
     reached, undriven = with_growing_modes_reached(plant)
     own = on_plant(reached, fault_map, weights)._replace(undriven=undriven)
     return designed(reached, own, "h2").least_gain
+
+
+def least_gain_of_every_start(plant: DescriptorSystem, fault_map: FaultMap, weights: Any) -> float:
+    """Return the least gain of filters whose errors decay whatever the start of undriven modes.
+
+    Those on the boundary of stability have the least noise that is tried, in place of the limit of ever less.
+    """
+    reached, undriven = with_growing_modes_reached(plant, ADDED_DRIVES[-1])
+    own = on_plant(reached, fault_map, weights)._replace(undriven=undriven)
+    return designed(reached, own, "hinf").least_gain

@@ -24,6 +24,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     filter_in_plant_units,
     first_problem,
     least_deviation_of_every_start,
+    least_gain_of_every_start,
     on_plant,
     unit_of_gains,
 )
@@ -72,6 +73,10 @@ LASTING_NOTE = (
     "A mode of the plant does not decay, and no noise drives it: a filter of least gain may ignore it, and its "
     "errors do not decay then. This one was found with a little noise on that mode; its claims are for the plant "
     "without it."
+)
+EVERY_START_NOTE = (
+    " The least gain of filters whose errors decay after any start is about {} (computed, not proved); the bound is "
+    "also of filters that ignore that mode."
 )
 MODES_NOTE = (
     "Modes of the plant that decay are in the errors of this filter, not in its state: after a start that is not at "
@@ -176,7 +181,7 @@ def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Sy
 
 def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis:
     """Return the filter for the largest noise on modes that last of which less does not lower the gain."""
-    best, least_gain = None, math.inf
+    best, least_gain, fault_map = None, math.inf, None
     for drive in ADDED_DRIVES:
         driven = with_lasting_modes_driven(plant, drive)
         try:
@@ -186,14 +191,27 @@ def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -
             # With less noise rounding may spoil the proof; the filter for more of it is proved already.
             if best is None:
                 raise
-            return best
+            break
         gain, least = made.certificate.claims["gain"], made.certificate.claims.get("least", 0.0)
         if best is not None and gain >= least_gain * (1.0 - CLOSED_GAP):
-            return best
-        best, least_gain = made, gain
-        if chosen.is_nothing or gain - least <= CLOSED_GAP * gain:
             break
-    return made
+        best, least_gain, fault_map = made, gain, chosen.fault_map
+        if chosen.is_nothing or gain - least <= CLOSED_GAP * gain:
+            return made
+    assert best is not None
+    assert fault_map is not None
+    return _with_least_of_every_start(plant, options, best, fault_map)
+
+
+def _with_least_of_every_start(
+    plant: DescriptorSystem, options: OptimalFilterMethod, made: Synthesis, fault_map: FaultMap
+) -> Synthesis:
+    """Return a design whose note has the least gain of filters whose errors decay, where one was found."""
+    try:
+        least = least_gain_of_every_start(plant, fault_map, options.weights)
+    except (PreconditionError, SolverError):
+        return made
+    return replace(made, notes=(*made.notes[:-1], made.notes[-1] + EVERY_START_NOTE.format(f"{least:.6g}")))
 
 
 def synthesis_of_gains(
