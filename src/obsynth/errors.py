@@ -1,4 +1,4 @@
-"""The errors of obsynth: one type per kind of bad news, each with its exit code, and its facts for programs."""
+"""The errors of obsynth: one class for each kind of failure, with its exit code and machine-readable facts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of results, readable without colour; nothing is shown or saved here: ``obsynth.plotting.plot_faults``.
+"""Plots of results, readable without colour; functions return axes, and neither show nor save them.
 
 A picture is imported when it is first used.
 """

@@ -1,4 +1,4 @@
-"""Types of what obsynth's functions return and take, for annotations: ``obsynth.types.Simulation``."""
+"""Types of the arguments and results of obsynth's functions, for annotations: ``obsynth.types.Simulation``."""
 
 from importlib import import_module
 from typing import Any

@@ -1,3 +1,3 @@
-"""The version of obsynth, where every package can see it."""
+"""The version of obsynth, importable from every room."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Structure of a plant with its evidence, and questions about one that may not be what was meant."""
+"""Structure of a plant with the evidence for it, and questions about plants that may be mistyped."""
 
 from __future__ import annotations
 

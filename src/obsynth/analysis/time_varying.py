@@ -1,4 +1,4 @@
-"""What is known of a time-varying plant before a design: its steps as they are used, rank and condition of H_k."""
+"""Properties of a time-varying plant before a design: its step matrices, and the rank and condition of H_k."""
 
 from __future__ import annotations
 

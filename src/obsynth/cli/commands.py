@@ -1,4 +1,4 @@
-"""The verbs: thin, each one call into the package and one report."""
+"""The verbs of designs: each makes one call into the package and prints one report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The papers' conditions as problems of cvxpy, to read, to change and to solve; and the inequalities they are made of.
+"""The papers' conditions as cvxpy problems, to read, change and solve, and the matrix inequalities they consist of.
 
 - of the papers, each returns `Conditions`: ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand``,
   ``kalman``;

@@ -1,4 +1,4 @@
-"""cvxpy under its own names, loaded at the first of them: it takes a second, and few designs solve an inequality."""
+"""Lazy import of cvxpy, which takes a second to load and which few designs need."""
 
 from __future__ import annotations
 

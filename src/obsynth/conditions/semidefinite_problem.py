@@ -1,4 +1,4 @@
-"""A cvxpy problem that is solved by Clarabel where no solver is named, by way of a smaller one if there is one."""
+"""A cvxpy problem that Clarabel solves by default, through a smaller equivalent problem where there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Faults that turn with the scheduling, decoupled exactly by a correction that turns with them; two vertices.
+r"""Inequalities for faults whose direction changes with the scheduling, decoupled by a correction; two vertices.
 
 With constant ``T E + N C = I`` and ``xhat = z + N y``, corrected at once by ``K(mu) (y - C xhat)`` where z was formed
 with the same mu, the corrected error obeys

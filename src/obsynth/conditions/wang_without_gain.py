@@ -1,4 +1,4 @@
-r"""The inequality (45) of Wang et al. 2015 without Y: the same P and gamma, from two inequalities of half its size.
+r"""Inequality (45) of Wang et al. 2015 after elimination of Y: the same P and gamma from two smaller inequalities.
 
 (45) is affine in Y with nothing beside it, so that a Y exists if and only if (projection lemma) M < 0 and, with N a
 basis of the null space of ``[C1 D1]``,

@@ -1,4 +1,4 @@
-"""Alarms of an exported observer: levels of its outputs, and a monitor that upper rooms write as C."""
+"""Alarms of an exported observer: thresholds of its outputs, and the C code of a registered monitor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""C in single precision: numbers as floats, and the tolerances that belong to them."""
+"""C code in single precision: number formats, and the tolerances that single precision needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measured error of the C of a nonlinear observer in single precision.
+"""Measured error of the C code of a nonlinear observer in single precision.
 
 No bound follows from the design alone, as each step is solved by iteration: the C runs beside the observer in double
 precision over records that are simulated from the design, with missing samples.

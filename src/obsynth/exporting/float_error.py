@@ -1,4 +1,4 @@
-"""How far an observer in single precision may be from the one in double precision."""
+"""Bounds on the difference between an observer in single precision and the one in double precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a proof file says of parameters that change slowly: the inequalities of ``SlowCourses`` and ``SlowFlow`` of
+"""Claims for slowly changing parameters in proof files: the inequalities of ``SlowCourses`` and ``SlowFlow`` of
 ``checker/check_proof.py``, and what shows them, in exact numbers."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scheduled observers as arrays for numpy and MATLAB: a page for each vertex, and what the weights are made of."""
+"""Scheduled observers as arrays for numpy and MATLAB: a page for each vertex, and the data of the weights."""
 
 from __future__ import annotations
 

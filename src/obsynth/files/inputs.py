@@ -1,4 +1,4 @@
-"""Files that are read: regular ones only, each of them protected from being overwritten by the same command."""
+"""Input files: only regular files are read, and the same command cannot overwrite them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing files: whole or not at all, never over inputs, and over other files only where the caller allows it."""
+"""Output files: written completely or not at all, never over inputs, and over other files only on request."""
 
 from __future__ import annotations
 

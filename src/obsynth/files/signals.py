@@ -1,4 +1,4 @@
-"""Signals that end a process, made into exceptions, so that what is half done is removed or saved first."""
+"""Signals that end a process as exceptions, so that unfinished files are removed and states are saved."""
 
 from __future__ import annotations
 

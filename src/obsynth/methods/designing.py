@@ -1,4 +1,4 @@
-"""From a plant to a verified design: the only place that goes analyse -> synthesise -> verify."""
+"""From a plant to a verified design: the only module that calls analysis, synthesis and verification in turn."""
 
 from __future__ import annotations
 

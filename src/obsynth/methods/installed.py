@@ -1,4 +1,4 @@
-"""Where methods are: obsynth's own, and those that other packages register by the entry points ``obsynth.methods``.
+"""Installed methods: those of obsynth, and those of other packages with the entry point ``obsynth.methods``.
 
 Nothing of a method is imported here: `obsynth.methods.registry` does that when it is used.
 """

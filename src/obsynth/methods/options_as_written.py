@@ -1,4 +1,4 @@
-"""Options about the equations and states of a plant as written, for its proper form: of a plant whose index is reduced.
+"""Options that refer to equations and states as written, restated for the proper form of a plant of reduced index.
 
 Process noise with covariance Q enters the equations as written.  It is carried through the reduction as any signal is:
 the proper form's Q is that of the noise that arrives, exactly.  What is stated of the states is that of the free ones.

@@ -1,4 +1,4 @@
-"""Remedies for a refused design, each tried: options at their defaults, sensors, signals left out, other methods."""
+"""Suggestions for a refused design, each of them tried: default options, more sensors, fewer signals, other methods."""
 
 from __future__ import annotations
 

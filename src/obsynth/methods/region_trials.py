@@ -1,4 +1,4 @@
-"""Whether one certificate holds over a whole region: decided by a design that is verified, where it is small enough."""
+"""Whether one certificate covers a whole region: decided by a verified design, where that is fast."""
 
 from __future__ import annotations
 

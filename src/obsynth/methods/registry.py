@@ -1,4 +1,4 @@
-"""The classes of methods by id, obsynth's own and those of other packages; which take a plant of a kind."""
+"""Registry of method classes by id, of obsynth and other packages, and which of them take a kind of plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Designs that rounding makes useless: what it may do to the estimates of an observer.
+"""Detection of designs that rounding makes useless: bounds on its effect on the estimates.
 
 Outputs ``y = G f`` right to the last digit change an estimate by up to ``u (|Cz| |(s - Az)^-1| |By| + |Dy|) |G| |f|``,
 u the unit roundoff, in any units; the observer's own numbers, with z its state, by up to

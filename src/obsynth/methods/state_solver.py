@@ -1,4 +1,4 @@
-"""States of a plant from an observer that estimates faults alone."""
+"""Recovery of a plant's states from an observer that estimates only faults."""
 
 from __future__ import annotations
 

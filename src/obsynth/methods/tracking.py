@@ -1,4 +1,4 @@
-"""The states of its plant that a linear observer follows, of any method that has an error model."""
+"""Tracked states: the states of the plant that a linear observer follows, for any method with an error model."""
 
 from __future__ import annotations
 

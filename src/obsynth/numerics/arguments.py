@@ -1,4 +1,4 @@
-"""Arguments of callers, checked: never a raw TypeError, always with the name of the argument.
+"""Checks of arguments: errors always name the argument, and no raw TypeError reaches the caller.
 
 Types of option values with their ranges: stated once, read by constructors, by options and by the spec's schema.
 """

@@ -1,4 +1,4 @@
-"""Making plain input into checked, read-only float arrays."""
+"""Conversion of input into checked, read-only float arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vector autoregressions: fitted by least squares with the order of Akaike's criterion, whitening, and simulated.
+"""Vector autoregressions: least-squares fits with the order of Akaike's criterion, whitening, and simulation.
 
 ``x_t = c + sum A_i x_{t-i} + W^-1 e_t`` with white e of unit covariance.
 """

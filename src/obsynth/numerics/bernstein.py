@@ -1,4 +1,4 @@
-r"""Bernstein form on pieces of [0, 1]: the weights by which coefficients of products and derivatives follow from data.
+r"""Bernstein form on pieces of [0, 1]: weights that give the coefficients of products and derivatives.
 
 A polynomial :math:`P(t) = \sum_j {d \choose j} t^j (1 - t)^{d - j} P_j` lies, on an interval, in the convex hull of its
 coefficients there: a matrix polynomial whose coefficients on every piece are positive definite is so on [0, 1].  All

@@ -1,4 +1,4 @@
-"""Points that span a convex hull, and the others as means of them."""
+"""Extreme points of a convex hull, and the other points as convex combinations of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows of samples that see no fault and no unknown input: fault estimation as one problem of estimation.
+"""Windows of samples free of faults and unknown inputs, which turn fault estimation into plain estimation.
 
     xi+ = A xi + B w,   r = C xi + D w,   e0 = L xi + D1 w
 

@@ -1,4 +1,4 @@
-"""Indefinite Riccati equations by doubling: products and solves alone, so that hundreds of states take little time."""
+"""Indefinite Riccati equations by a doubling algorithm: only products and solves, fast for hundreds of states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small arithmetic language for data: Python parses it, and only known operations of its tree are read.
+"""A small language of arithmetic expressions: Python parses them, and only known operations are allowed.
 
 Numbers, names, ``+ - * / **``, parentheses, a fixed list of functions, and ``where(a > b, c, d)``, which is c where
 a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative with respect to time of any expression.

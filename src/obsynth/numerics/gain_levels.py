@@ -1,4 +1,4 @@
-"""Whether the H-infinity norm of a stable system is at most a level, by one Riccati equation in doubles."""
+"""Whether the H-infinity norm of a stable system is at most a level, by a Riccati equation in double precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sums of powers of a stable matrix, near the boundary too."""
+"""Gramians of a stable matrix as sums of its powers, also near the stability boundary."""
 
 from __future__ import annotations
 

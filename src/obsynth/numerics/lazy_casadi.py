@@ -1,4 +1,4 @@
-"""CasADi under its own names, loaded at the first of them: few plants need it, and it has 93 MB."""
+"""Lazy import of CasADi, which has 93 MB and which few plants need."""
 
 from __future__ import annotations
 

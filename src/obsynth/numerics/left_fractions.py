@@ -1,4 +1,4 @@
-"""Filters of few states as left fractions: ``D(q) ehat_k = N(q) y_k`` in the backward shift q.
+"""Filters of low order as left fractions: ``D(q) ehat_k = N(q) y_k`` in the backward shift q.
 
 Every filter whose state follows the plant's has a left fraction whose row degrees add up to its order, and each row
 ``(N, D)`` lies in the left kernel of a window of the plant: it sees neither the state before the window, nor faults,

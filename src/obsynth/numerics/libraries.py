@@ -1,4 +1,4 @@
-"""The libraries underneath: computations beyond double precision, packages that are missing, and BLAS threads.
+"""Behaviour of numerical libraries: failures in double precision, missing packages, and BLAS threads.
 
 BLAS knows one number of threads for the whole process: it is set on entry and put back on exit, by one block at a time.
 """

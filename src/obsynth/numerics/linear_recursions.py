@@ -1,4 +1,4 @@
-"""Linear recursions over many steps: courses of a driven state, and impulse responses.
+"""Linear recursions over many steps: trajectories of a driven state, and impulse responses.
 
 Steps are taken in about as many blocks as each has steps, all blocks at once: two times the square root of the steps in
 Python, and the others within products of matrices.

@@ -1,4 +1,4 @@
-"""Units by least squares on the logarithms of the entries, rounded to powers of two.
+"""Balanced units by least squares on the logarithms of entries, rounded to powers of two.
 
 The unknowns only shift with the units of the data: up to the rounding of exponents, the result does not depend on them.
 """

@@ -1,4 +1,4 @@
-"""Stable models of few states near a target: balanced truncation, and a search over all their matrices.
+"""Stable low-order models near a target: balanced truncation, and a search over all their matrices.
 
 What is weighed is ``left_weight (F(p) shown - target)`` at points p of the circle or the axis, F the model.  Balanced
 truncation also takes the Gramians that these weights make (D. Enns, *Model reduction with balanced realizations*,

@@ -1,4 +1,4 @@
-"""Units of measurement as texts, such as those of the columns of a log; pint converts them (``obsynth[units]``)."""
+"""Units of measurement as texts, such as in the columns of a log, converted by pint (``obsynth[units]``)."""
 
 from __future__ import annotations
 

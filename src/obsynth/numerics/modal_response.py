@@ -1,4 +1,4 @@
-"""Frequency responses by modes: where one peaks, and where it crosses a level, as a symplectic pencil says."""
+"""Frequency responses by modes: peaks, and frequencies at which a level is crossed, by a symplectic pencil."""
 
 from __future__ import annotations
 

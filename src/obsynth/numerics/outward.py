@@ -1,4 +1,4 @@
-"""Bounds in a few digits, rounded outwards: what is printed is a bound as well."""
+"""Printed bounds: few digits, rounded outwards, so that the printed number is a bound as well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inputs that move the state without a trace in the outputs, and the system without them.
+"""Inputs that move the state but not the outputs, and the system without them.
 
 From x = 0 the inputs reach, with outputs of zero throughout, the largest output-nulling reachable subspace R* (H.
 Trentelman, A. Stoorvogel, M. Hautus, *Control Theory for Linear Systems*, 2001, section 8.1).  The state modulo R*, and

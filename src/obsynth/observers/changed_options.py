@@ -1,4 +1,4 @@
-"""An observer with other options: on outliers as a run on data has them, or as its recursion alone."""
+"""Observers with changed options: with outlier rules for a run on data, or without any, as a plain recursion."""
 
 from __future__ import annotations
 

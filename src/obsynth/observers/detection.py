@@ -1,4 +1,4 @@
-"""The outcome of a monitor, or of a decision on parameters, over one record: statistic, threshold, first alarm."""
+"""The result of a monitor, or of a decision on parameters, over one record: statistic, threshold, first alarm."""
 
 from __future__ import annotations
 

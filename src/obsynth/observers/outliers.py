@@ -1,4 +1,4 @@
-"""Rules for samples that a prediction excludes, and for estimates beyond bounds of the states.
+"""Outliers: rules that reject samples far from their prediction, and limits of estimates by bounds of the states.
 
 Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975): the
 limit of its prediction, and where this excludes no sample of a row, that of what its others say of it.  Where

@@ -1,4 +1,4 @@
-"""Runs that take long, and many of them: bars on the terminal, and work on any executor."""
+"""Progress bars of long runs, and many runs on any executor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of the numbers of an observer, and of the samples and records that it takes."""
+"""Checks of the names and delays of an observer, and of the numbers, samples and records that it gets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors that are sampled every so many rows, and whose values are delayed.
+"""Sensors with a slower sample rate, or with delayed values.
 
 A delayed value is put where it belongs: the observer keeps its states of the latest samples, and takes those samples
 again from the one that the value is about.  What it then knows is what it would know if everything had come in order.

@@ -1,4 +1,4 @@
-"""The samples of a run as a chain for backward smoothing."""
+"""The samples of a run, linked for backward smoothing."""
 
 from __future__ import annotations
 

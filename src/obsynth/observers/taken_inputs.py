@@ -1,4 +1,4 @@
-"""Known inputs that are missing in some samples: taken as they last were, within what their past lets them be off by.
+"""Missing known inputs: the last value is used, with a bound on its error from the input's past.
 
 An input moves by no more from one sample to the next than it did before, and not out of its range.  In m samples it may
 have moved that far all the time: as the same error acts in all of them, what it does is added up, and not its squares.

@@ -1,4 +1,4 @@
-"""A box of constants that a log allows, with its level: what tolerances take."""
+"""Calibrated boxes: ranges of constants that a log allows at a confidence level, for use as tolerances."""
 
 from __future__ import annotations
 

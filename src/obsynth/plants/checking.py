@@ -1,4 +1,4 @@
-"""Checks of the fields of a plant: every problem is collected before one error is raised."""
+"""Checks of a plant's fields, which collect all problems into one error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Physical constants with tolerances: a nominal value, a range, and where both come from."""
+"""Physical constants with tolerances: nominal value, range, and the source of both."""
 
 from __future__ import annotations
 

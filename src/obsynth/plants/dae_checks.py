@@ -1,4 +1,4 @@
-"""Checks of a nonlinear plant's equations as a whole: their number, empty ones, signals that enter nothing."""
+"""Checks of a nonlinear plant as a whole: number of equations, empty equations, signals without effect."""
 
 from __future__ import annotations
 

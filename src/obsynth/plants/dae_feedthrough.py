@@ -1,4 +1,4 @@
-"""Outputs of a nonlinear plant that read inputs: each such input becomes a state that equals it.
+"""Outputs of a nonlinear plant that depend on inputs directly: each such input becomes a state equal to it.
 
 The papers' outputs are ``h(x, theta)``; that of a battery, ``V = E - R * I``, reads an input, the current.
 """

@@ -1,4 +1,4 @@
-"""Dead times: by how many seconds a known input acts late, or the reading of a sensor is late."""
+"""Dead times: delays of known inputs and of sensor readings, in seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fields of a linear plant from arguments of callers: labelled frames, names for rows, noise of sensors."""
+"""Fields of a linear plant from a caller's arguments: labelled frames, names of rows, noise of sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Operating regions of nonlinear plants: ranges of signals and of linear combinations, and the slopes within them.
+"""Operating regions of nonlinear plants: ranges of signals and of their linear combinations, and slopes in them.
 
 A region is a set of ranges ``low <= expression <= high``, each of a state, a fault, an input or a linear combination of
 these such as ``h1 - h2``.  The arguments of nonlinearities get the ranges that follow, with outward rounding, and the

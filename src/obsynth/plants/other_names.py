@@ -1,4 +1,4 @@
-"""Arguments and keys of a plant or a profile by the names that books, Simulink and other libraries have for them."""
+"""Alternative names of arguments and keys, as in books, Simulink and other libraries, for suggestions in errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units in which a plant, its faults and its time are near one, whatever units it came in.
+"""Natural units of a plant: states, faults and time are near one in them, whatever units the plant came in.
 
 With ``x = S x'``, ``t = tau t'`` (no tau in discrete time): ``E' = Q E S``, ``A' = tau Q A S``, ``C' = Y C S``,
 ``Bf' = tau Q Bf Phi_f``, ``Phi' = tau W^-1 Phi W``; the factors are least squares in the logarithms of all entries.

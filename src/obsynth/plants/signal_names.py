@@ -1,4 +1,4 @@
-"""Names of signals: unique ones, and picking by name."""
+"""Names of signals: uniqueness, and selection by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a plant and its constants to a plant that knows its tolerances."""
+"""Plants with tolerances: from a plant and its constants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Proofs that a symmetric matrix, known up to rounding, is positive definite: a Cholesky factorisation that completes.
+r"""Proofs that a symmetric matrix, known up to rounding, is positive definite, by a Cholesky factorisation.
 
 S. M. Rump, *Verification of positive definiteness*, BIT 46, 2006 (formally proved by P. Roux in Coq).  With
 :math:`\gamma_k = k u / (1 - k u)`, and R the computed factor of :math:`\tilde A` of order n:

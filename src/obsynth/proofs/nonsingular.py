@@ -1,4 +1,4 @@
-"""Matrices that are nonsingular for certain: an approximate inverse with a residual below one, outward rounded.
+"""Proofs that a matrix is nonsingular: an approximate inverse with a residual below one, rounded outwards.
 
 With ``|I - B M| < 1`` in any norm of matrices ``B M`` is nonsingular, and so is M (S. M. Rump, Acta Numerica 2010,
 section 10).

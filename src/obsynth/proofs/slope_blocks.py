@@ -1,4 +1,4 @@
-r"""One matrix in place of all corners of slopes: a block of order n + q with a diagonal multiplier, in continuous time.
+r"""One matrix in place of all corners of slopes: order n + q, with a diagonal multiplier, in continuous time.
 
 ``E e' = (M + F diag(d) V) e + B w``, ``z = Cz e + Dz w``, every ``|d_k| <= 1`` as it likes.  With ``T >= 0`` diagonal
 

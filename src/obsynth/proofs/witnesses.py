@@ -1,4 +1,4 @@
-r"""Witnesses of matrix inequalities in whole numbers, which exact arithmetic accepts without a search.
+r"""Witnesses of matrix inequalities with integer entries, which exact arithmetic checks directly.
 
 Numbers are dyadic, ``integer 2^e``.  That a symmetric S is positive definite is shown by F and positive d: with
 ``R = S - F'F``, each row of R dominates its others in units d, so that ``x'Sx = |Fx|^2 + x'Rx > 0``.  F is the Cholesky

@@ -1,4 +1,4 @@
-"""A scenario that shows what a design does, made from the design alone: each fault in turn."""
+"""A demonstration scenario for a design, made from the design alone: a step of each fault in turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The head of a page: which faults can be detected, how small, how soon, with which rate of false alarms."""
+"""The head of a page: detectable faults, least sizes, delays, and the rate of false alarms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One self-contained HTML page about a design: the verdict first."""
+"""The HTML page about a design: one self-contained file, with the verdict first."""
 
 from __future__ import annotations
 

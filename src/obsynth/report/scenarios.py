@@ -1,4 +1,4 @@
-"""Simulations for people: how far estimates were off."""
+"""Printed reports on simulations: errors of the estimates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plots of a page that can be zoomed: uPlot and the data are in the page, which needs no network."""
+"""Zoomable plots on a page: uPlot and the data are part of the page, which needs no network."""
 
 from __future__ import annotations
 

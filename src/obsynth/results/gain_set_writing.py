@@ -1,4 +1,4 @@
-"""From a design to the file that holds it: a JSON document with a schema version and a digest.
+"""Writing of gain sets: a design as a JSON document with a schema version and a digest.
 
 Large ones are a zip of the document and its arrays as ``.npz``, uncompressed and with a fixed date: the same design
 gives the same bytes.  Designs are taken as they come (`obsynth.results.design` stands above this module).

@@ -1,4 +1,4 @@
-"""A verification report: its rows, and whether all of them hold."""
+"""The verification report: its checks, and whether all of them pass."""
 
 from __future__ import annotations
 

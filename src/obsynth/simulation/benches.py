@@ -1,4 +1,4 @@
-"""Designs and scenarios side by side, ready to run: plant, signals and observer, once for each of many seeds."""
+"""Simulation benches: plant, signals and observer of several designs, ready to run for many seeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulating a DAE on its own equations, by default with Radau IIA: not with the observer's discretisation."""
+"""Simulation of a DAE by its own equations, by default with Radau IIA, not with the observer's discretisation."""
 
 from __future__ import annotations
 

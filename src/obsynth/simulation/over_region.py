@@ -1,4 +1,4 @@
-"""Simulation of polytopic plants along courses of their scheduling parameters: many runs at once.
+"""Simulation of polytopic plants along trajectories of their scheduling parameters: many runs at once.
 
 Dynamic and algebraic equations are separated once, as E is the same everywhere.  Discrete plants step by their own
 equations.  Continuous ones step by the matrix exponential at the middle of short parts of each interval, which is exact

@@ -1,4 +1,4 @@
-"""What happens to a plant in a simulation: inputs, faults, disturbances, sensors, noise, start and length."""
+"""Scenarios: inputs, faults, disturbances, sensor failures, noise, initial state and length of a simulation."""
 
 from __future__ import annotations
 

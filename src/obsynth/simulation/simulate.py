@@ -1,4 +1,4 @@
-"""A design on a scenario: the plant simulated, the observer beside it, how far its estimates are off, as a table."""
+"""Simulation of a design on a scenario: plant, observer, and errors of the estimates as a table."""
 
 from __future__ import annotations
 

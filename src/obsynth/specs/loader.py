@@ -1,4 +1,4 @@
-"""Specs loaded: a plant that a method can use, transformed as the spec says, and a scenario to simulate."""
+"""Loading of specs: the plant with its transformations, the method with its options, and the scenario."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the plant sections of a checked document to plants, with the tolerances of their constants."""
+"""Plants from the plant sections of a checked document, with the tolerances of their constants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of a spec that are written with their unit, ``5 mV``, in the unit that the spec states of their signal."""
+"""Numbers with a unit in a spec, such as ``5 mV``, converted to the unit that the spec states for the signal."""
 
 from __future__ import annotations
 

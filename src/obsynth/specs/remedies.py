@@ -1,4 +1,4 @@
-"""Suggestions for values and keys that a spec does not take: sentences for messages, after a blank.
+"""Suggestions in messages about invalid values and keys of a spec.
 
 Every sentence names the text to write; it is empty where none is certain.
 """

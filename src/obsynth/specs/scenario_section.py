@@ -1,4 +1,4 @@
-"""From the scenario section of a document to a scenario that can be simulated."""
+"""Scenarios from the scenario section of a checked document."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages on documents that are no YAML: the place, the line, and what to write instead."""
+"""Messages about documents with invalid YAML: the place, the line, and a correction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cases of a sweep: each combination of specs or plants and values, with a digest of all that its design reads."""
+"""The cases of a sweep: combinations of plants and values, each with a digest of everything its design reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One method of a comparison: its figures for each fault, its responses and estimates, or why it does not exist."""
+"""One method of a comparison: figures, responses and estimates for each fault, or why it does not exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records on which designs are compared: runs of drawn plants in a scenario, or a log."""
+"""Records for a comparison: runs of random plants on a scenario, or a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every method that exists for a plant, designed, on one clock and on the same draws.
+"""Comparison of all methods that exist for a plant, at one sample time and on the same random runs.
 
 The stated scenario, many times: disturbances, noise and tolerances drawn; the same draws for every method.
 """

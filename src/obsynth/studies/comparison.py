@@ -1,4 +1,4 @@
-"""The result of `obsynth.compare`: one row per method, one recommendation, one picture."""
+"""The result of `obsynth.compare`: one row for each method, a recommendation, and a plot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delays of alarms at equal healthy time in alarm, on a log: each design has the level that as many normal rows pass.
+"""Detection delays on a log at equal false-alarm rates: each design gets the threshold that has this rate.
 
 A threshold trades healthy time in alarm for delay, so that designs can only be compared where one of them is equal.
 The level of each fault's estimate is what at most a share of the rows without faults is beyond, from their median.

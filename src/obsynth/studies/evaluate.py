@@ -1,4 +1,4 @@
-"""Many runs of a scenario, each with its own seed: how often alarms are false, late, missing or blame another fault."""
+"""Evaluation of alarms over many random runs of a scenario: false, late, missed and misattributed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many designs on many logs: every gain set of a folder on the logs that are for it, on any executor."""
+"""Many designs on many logs: every gain set of a folder on its logs, on any executor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The least threshold of any test beside that of every method: same bounds, same delay, same faults decoupled."""
+"""Least threshold of any test compared with each method's: the same bounds, delay and decoupled faults."""
 
 from __future__ import annotations
 

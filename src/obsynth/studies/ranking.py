@@ -1,4 +1,4 @@
-"""What methods are ranked by: errors of their estimates, delays of their alarms; in numbers and in words."""
+"""Ranking of methods by errors of their estimates or delays of their alarms, in numbers and in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The result of a robustness analysis over the box of constants: frozen, as lines of text and as plain data."""
+"""The result of a robustness analysis over the box of constants, as lines of text and as plain data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which sensors to add, ranked by cost and then by how well the fault can be estimated after design."""
+"""Sensor placement: sets of sensors ranked by cost, then by the quality of the fault estimate after design."""
 
 from __future__ import annotations
 

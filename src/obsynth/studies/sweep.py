@@ -1,4 +1,4 @@
-"""Many designs at once: specs or plants, operating points, sensor sets and options, on any executor."""
+"""Sweeps: many designs over plants, operating points, sensor sets and options, on any executor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluations and comparisons as tables: how often alarms were right, how far estimates were off."""
+"""Tables of evaluations and comparisons: rates of alarms, errors of estimates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors, sample time and number of samples that let a fault of a given size be detected: by least thresholds."""
+"""Sensors, sample time and number of samples with which a fault of a given size is detected by a guaranteed test."""
 
 from __future__ import annotations
 

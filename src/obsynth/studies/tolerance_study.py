@@ -1,4 +1,4 @@
-"""The tolerance study: false alarms and the least detected fault, of a fixed bound and of an adaptive one."""
+"""The tolerance study: false alarms and the least detected fault, with a fixed and with an adaptive threshold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cases run on any executor: results are kept in a folder, finished cases are not run again, and all make a table."""
+"""Cases on any executor: results are stored in a folder, finished cases are skipped, and a table has all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Whether the estimate of a constant fault equals it in the end, for the plant with the stored observer.
+r"""Steady estimates of constant faults: whether they equal the fault, for the plant with the stored observer.
 
 Where both settle (`obsynth.verification.settled_faults`) the estimate there is to be f, whatever the delay, or what the
 method says; what rounding adds as the observer runs in double precision (`rounding_in_operation`) counts.  Where the

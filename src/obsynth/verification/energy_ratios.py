@@ -1,4 +1,4 @@
-"""The ratio of two energies for one combination of signals near the worst, rounded down."""
+"""Lower bound on the gain from one combination of signals near the worst: a ratio of energies, rounded down."""
 
 from __future__ import annotations
 

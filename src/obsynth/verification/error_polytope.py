@@ -1,4 +1,4 @@
-r"""The error system of an observer whose plant is known to lie in a polytope: the one form of designs over a region.
+r"""The error system of an observer whose plant lies in a polytope, as all designs over a region use it.
 
 .. math::
     e^+ = (A(\mu) - L(\mu) C(\mu)) e + (B(\mu) - L(\mu) D(\mu)) w, \qquad z = C_z(\mu) e + D_z(\mu) w

@@ -1,4 +1,4 @@
-"""Where an exact fault map must vanish: zeros of the faults that are not strictly stable.
+"""Zeros of an exact fault map: the zeros of the faults that are not strictly stable.
 
 Faults ``f exp(z t)`` (or ``f z^k``) in the direction of such a zero, with decoupled inputs and states that grow from
 nothing, leave all outputs at zero.  Every causal filter then estimates nothing, and an exact fault map M has

@@ -1,4 +1,4 @@
-"""Fault models of a certificate against those that the options name: a filter for steps is none for ramps."""
+"""Fault models of a certificate compared with those of the options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gains of stable systems that are proved without a certificate: a pencil that is regular all along the unit circle."""
+"""Proved gains of stable systems without a certificate, by a pencil that is regular on the whole unit circle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Identities that must hold between plant and observer, and how far they are from holding.
+"""Identities between plant and observer, and the residuals of stored numbers in them.
 
 An identity is a sum of terms that vanishes.  Its residual is judged entry by entry against what double precision can
 do to the terms, and, for gains that were printed to some decimals, against what that rounding can do.

@@ -1,4 +1,4 @@
-"""Faults and noise of ever higher frequency that no output shows: a bound by what passes the reference model at once.
+"""Lower bound on the gain by high frequencies: what passes the reference model directly and no output shows.
 
 Continuous time, index one.  With ``E x0 = 0``, ``E x1 = A x0 + Bh h + Bw w`` and ``C x0 + Dh h + Dw w = 0`` the signals
 ``(h, w) e^{s t}`` drive outputs that vanish like 1/s, and so does what a causal filter of finite gain makes of them:

@@ -1,4 +1,4 @@
-"""Faults and noise of the whole past that no output shows: a proved lower bound on the gain of every causal filter.
+"""Proved lower bound on the gain of every causal filter, by faults and noise that no output has shown so far.
 
 Whatever satisfies the plant's equations with u = 0 and y = 0 up to now is invisible: a causal filter of finite gain,
 linear or not, estimates 0, so that its gain is at least the energy ratio of what it misses to the noise.  Here

@@ -1,4 +1,4 @@
-"""Proof that no filter of a family has a smaller gain: a mixture of disturbances that its gains cannot see.
+"""Proof that no filter of a family has a smaller gain, by a combination of disturbances that no gain sees.
 
 The filters with these T and N (and W unless it is free) differ by ``L' - L`` and ``W' - W`` that vanish on Upsilon: a
 pair (e, d) with ``C e + D d`` in the range of Upsilon leads to the next error and to xi whatever the gains. Each F with

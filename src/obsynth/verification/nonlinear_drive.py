@@ -1,4 +1,4 @@
-"""Inputs and outputs of the error system of an observer over a region, from its options, as matrices."""
+"""Input and output matrices of the error system of an observer over a region, from its options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two norms of a detection filter, proved in outward rounding on its stored numbers.
+"""Proofs of the two norms of a detection filter, in outward rounding on its stored numbers.
 
 The gain: a bounded real inequality.  The least singular value of ``G(jw) = C (jw - A)^-1 B + D`` is above a level on a
 range of frequencies if it is at one of them, and if

@@ -1,4 +1,4 @@
-"""Rows on scheduled designs: what is claimed for every point of a region, and for every trajectory of the parameters.
+"""Checks of scheduled designs: claims for every point of a region and every trajectory of the parameters.
 
 The plant and the observer are both means of vertices with the same weights, so that what is linear in both is checked
 at the vertices; what is proved there in balls is true for every course of the weights (`obsynth.proofs.

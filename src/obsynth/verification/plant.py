@@ -1,4 +1,4 @@
-"""Rows about the plant: what it is, the existence conditions, and elimination and sampling done again as written."""
+"""Checks of the plant: its properties, existence conditions, and a repetition of elimination and sampling."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Enclosed errors from rounding in the estimate of a constant fault, while an observer runs in double precision.
+r"""Bounds on the error of a constant fault's estimate by rounding while an observer runs in double precision.
 
 Every sum of products of double precision is right to ``g = n u / (1 - n u)`` of the sum of their sizes, in whatever
 order the n products are added (N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 3.1).  With

@@ -1,4 +1,4 @@
-r"""Samples of a continuous polytope of error systems, whose parameter rests over each sample: vertices and a remainder.
+r"""Sampling of a continuous polytope of error systems with constant parameters in each sample, with a remainder.
 
 :math:`e^{T A(\mu)}` is no mean of the :math:`e^{T A_i}`, but nearly so.  Along a line in the hull its second derivative
 is at most :math:`T^2 |H|^2 e^{a T}`, a the largest logarithmic norm (0 or more), and what a function with such a

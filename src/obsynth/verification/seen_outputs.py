@@ -1,4 +1,4 @@
-"""What a filter of the faults sees: disturbances that count as noise, and outputs without those that add nothing."""
+"""The outputs and disturbances that a filter of the faults uses: without redundant outputs, disturbances as noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Where a plant and its observer settle under constant faults, enclosed.
+r"""Enclosed steady state of a plant and its observer under constant faults.
 
 With ``lambda = 1`` (0 in continuous time), x the plant's state under a constant fault f, and z the observer's,
 

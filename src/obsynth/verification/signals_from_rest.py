@@ -1,4 +1,4 @@
-"""Last samples of signals that start from rest and that no output shows; what an index above one needs after them."""
+"""Final samples of invisible signals that start from rest, and their continuation for plants of index above one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plant whose noise or faults are outputs of weights: signals of unit size drive the weights, and these the plant.
+"""A plant with weighted noise or faults: signals of unit size drive the weights, whose outputs drive the plant.
 
 Each weighted signal v is an algebraic variable of the new plant, ``0 = -v + Cw xw + Dw n``: no number is rounded, so
 that what is proved of the new plant is proved of plant and weights as given.

@@ -1,4 +1,4 @@
-"""The worst combination of faults and noise that no output shows, in double precision: where a proof looks first.
+"""The worst combination of invisible faults and noise, in double precision, as a starting point of a proof.
 
 Of each point there are as many invisible signals as inputs beyond the outputs, and the ratio of error to noise is the
 largest for one combination of all of them.  It is computed here, and nothing is concluded from it: a proof that

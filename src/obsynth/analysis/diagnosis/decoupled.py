@@ -1,4 +1,4 @@
-"""A plant without its unknown inputs: diagnosis decides on it, and filters are built on it."""
+"""The part of a plant that is decoupled from its unknown inputs, on which faults are diagnosed and filters designed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detectability of a fault over the rational numbers, for plants whose numbers are as somebody wrote them.
+"""Detectability of faults in rational arithmetic, for plants with stated numbers.
 
 The reduction of `obsynth.analysis.diagnosis.reduction` over the rational numbers: no tolerance, so no gap.
 """

@@ -1,4 +1,4 @@
-"""One fault on a decoupled plant: whether it shows, where it does not, and how fast it does.
+"""One fault of a decoupled plant: whether it is visible, its blocking zeros, and the order of its estimate.
 
 With N a minimal polynomial basis of the left null space of the unknowns' pencil, the zeros of the fault are those of
 the greatest common divisor of ``g = N [bf; df]``; decoupled: where ``[F; G]`` lies in the range of ``[A - sE; C]``.

@@ -1,4 +1,4 @@
-"""How far faults are from looking alike: what is left of the effect of one when others may have any size.
+"""Margins of isolability: the part of a fault's effect that no combination of other faults explains.
 
 At a point s (signals at rest, or a sinusoid) the outputs are ``y = G(s) f + Gd(s) d``, ``G = C (sE - A)^-1 Bf + Df``.
 A residual that is blind to the faults j and to d sees of fault i the part of its column that is orthogonal to theirs.

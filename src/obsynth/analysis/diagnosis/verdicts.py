@@ -1,4 +1,4 @@
-"""Results of a diagnosis that print themselves: what is known of each fault, and the bank of structured residuals."""
+"""Results of a diagnosis: the verdict on each fault and the bank of structured residuals, with printed tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The left singular part of a pencil, by orthogonal transformations, with the rows it is made of.
+"""Separation of the left singular part of a pencil by orthogonal transformations, and the rows that span it.
 
 Without finite zeros, infinite and right singular part, ``[A_o - s E_o; C_o]`` is left: observable, with the left null
 space of the whole.  The pencil must come balanced; balancing again on the way would blow rounding up.

@@ -1,4 +1,4 @@
-"""Pencils and null vectors of plants with unknown inputs and fault models, in floating point and as written."""
+"""Pencils of a plant with unknown inputs and fault models, and their null vectors, in floating point and exactly."""
 
 from __future__ import annotations
 

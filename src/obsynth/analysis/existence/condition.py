@@ -1,4 +1,4 @@
-"""Existence conditions as named facts, so that each can be shown, checked again, or raised."""
+"""Existence conditions as values with a name, numbers and a verdict, to be shown, verified or raised as errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a detection filter exists: named conditions, decided exactly where the numbers are as somebody wrote them."""
+"""Existence conditions of a detection filter, decided exactly for plants with stated numbers."""
 
 from __future__ import annotations
 

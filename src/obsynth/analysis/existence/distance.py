@@ -1,4 +1,4 @@
-"""How far a pencil is from losing rank in the closed unstable region: its least singular value there, in scaled units.
+"""Distance of a pencil from losing rank in the unstable region: its least singular value there, in scaled units.
 
 Estimated, not proved: the least that is found on the boundary, near all zeros and, for tall pencils, at the unstable
 points where a random compression of the rows loses rank, which are close to where the pencil nearly does.

@@ -1,4 +1,4 @@
-"""When a PD observer exists, before any solver runs.  Source: Filasova, Krokavec, Serbak, section 2.
+"""Existence conditions of a PD observer.  Source: Filasova, Krokavec, Serbak, section 2.
 
 Theorem 1 has a solution, for every delta > 0, exactly when the plant with its faults as states is detectable: (A, C)
 is, and at s = 0 rank condition (3) holds.  Observability of (A, C), which the paper supposes, is more than needed.

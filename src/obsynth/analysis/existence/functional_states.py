@@ -1,4 +1,4 @@
-"""Which states, or functionals of the state, the outputs determine whatever the unknown inputs and faults are."""
+"""States and functionals of the state that the outputs determine, whatever unknown inputs and faults are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether constant parameters leave traces in the outputs that can be distinguished.
+"""Identifiability of constant parameters: whether their effects on the outputs are linearly independent.
 
 Plants with constant matrices are decided as written: up to 64 states in rational arithmetic (24 of a sampled plant, in
 enclosures); the parameters stand where faults do.

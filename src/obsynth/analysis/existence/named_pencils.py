@@ -1,4 +1,4 @@
-"""Pencils whose entries know where in the plant they stand, and the nearest plants for which they lose rank.
+"""Pencils whose entries are traced to entries of the plant, and the nearest plants for which they lose rank.
 
 For v with ``M v`` small, rounded to a few digits, one entry (two if v is complex) in each row of M is changed in
 rational arithmetic so that ``M v = 0``: the changed matrix loses rank exactly, and the changed entries are named.

@@ -1,4 +1,4 @@
-"""What an observer of a nonlinear plant over a region needs: constant E, independent derivatives, bounded slopes."""
+"""Existence conditions of an observer over a region of a nonlinear plant: constant E, bounded slopes, detectability."""
 
 from __future__ import annotations
 

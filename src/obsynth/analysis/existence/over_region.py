@@ -1,4 +1,4 @@
-r"""When a fault-estimation filter exists over the whole region of a polytopic plant, with exact decoupling.
+r"""Existence conditions of a fault-estimation filter over the region of a polytopic plant, with exact decoupling.
 
 Wang et al. 2015 at a plant of which A, B, Bd change, with a constant ``T E + N C = I``: if the faults keep their
 directions, ``Bf(mu) = Bf0 Delta(mu)`` with Delta nonsingular on the hull, and reach the outputs after one sample

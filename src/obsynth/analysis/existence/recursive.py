@@ -1,4 +1,4 @@
-"""Whether a recursive method can work for a plant: rank of H_k, detectability, parameters that show.
+"""Existence conditions of recursive methods: rank of H_k, detectability, identifiable parameters.
 
 Of a plant whose matrices are constant this is decided on the numbers as written; of others in floating point along the
 horizon, as the rows say.

@@ -1,4 +1,4 @@
-"""Preparing a plant for the fault-estimation filter: sensor faults as states, units, T and N with ``T E + N C = I``.
+"""Preparation of a plant for the fault-estimation filter: sensor faults as states, units, ``T E + N C = I``.
 
 Source: Wang 2015, eqs. (7), (16)-(17). Differences: ``S = [I, C']`` gives a singular T, which loses algebraic
 equations, in 13 of 276 random systems: ours is nonsingular by construction. Feedthrough is exact in ``e = T E x - z``,

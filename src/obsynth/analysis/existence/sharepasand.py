@@ -1,4 +1,4 @@
-"""When an unknown-input PI observer exists, on the plant's own data.
+"""Existence conditions of an unknown-input PI observer.
 
 In place of Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6 (the last three are false as printed):
 (D1) ``rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]``,

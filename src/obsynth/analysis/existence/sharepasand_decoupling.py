@@ -1,4 +1,4 @@
-"""(D1): whether the unknown inputs can be decoupled without differentiating; and the elimination that may help.
+"""Existence condition (D1): unknown inputs can be decoupled without derivatives, or after an elimination.
 
 Source: Share Pasand, Aliyari, Taghirad, Lemma 4 (9.1), in the form of `obsynth.analysis.existence.sharepasand`.
 """

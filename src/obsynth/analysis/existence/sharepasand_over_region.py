@@ -1,4 +1,4 @@
-r"""When an unknown-input PI observer exists over the whole region of a polytopic plant.
+r"""Existence conditions of an unknown-input PI observer over the region of a polytopic plant.
 
 Share Pasand, Aliyari, Taghirad at a plant of which A, B, Bf, Bd change, with constant ``U E + Dhat C = I``: what the
 unknown inputs of all vertices move is decoupled at once, ``U Bd(mu) = 0``, and what is left, ``[U A(mu), U Bf(mu) Cw;

@@ -1,4 +1,4 @@
-"""Statements about a plant, and their answers: no (exactly), yes with its distance from another answer, and unclear.
+"""Statements about a plant and their evaluation: false (exactly), true with a distance from false, or unclear.
 
 It is unclear where that distance is no more than what rounding of the data or of any gains can bridge.
 """

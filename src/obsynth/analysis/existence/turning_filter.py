@@ -1,4 +1,4 @@
-r"""When faults that turn with the scheduling are decoupled exactly by a correction that turns with them.
+r"""Existence of an exact correction for faults whose direction changes with the scheduling parameters.
 
 With constant ``T E + N C = I`` the corrected error obeys ``eps+ = (I - K(mu) C) (T A(mu) eps + T Bd(mu) d)`` if
 

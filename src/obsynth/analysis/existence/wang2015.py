@@ -1,4 +1,4 @@
-"""When a fault-estimation filter exists: Wang et al. 2015, section 2 and Theorem 2 (i); the zero condition is ours."""
+"""Existence conditions of a fault-estimation filter: Wang et al. 2015, Theorem 2 (i), and a zero condition of ours."""
 
 from __future__ import annotations
 

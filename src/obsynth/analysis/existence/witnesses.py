@@ -1,4 +1,4 @@
-"""Unclear answers: the tolerance, a plant within it for which the answer is another one, and what would decide it."""
+"""Unclear answers: the tolerance, a witness (a plant within it with the opposite answer), and what would decide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's conditions of a finished design, with the matrices of its certificate put in."""
+"""The paper's conditions of a finished design, with the values of its certificate."""
 
 from __future__ import annotations
 

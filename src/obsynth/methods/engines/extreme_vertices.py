@@ -1,4 +1,4 @@
-"""The vertices that span a polytope of error systems: what repeats one, or lies among the others, has no inequality.
+"""Extreme vertices of a polytope of error systems: only these need an inequality.
 
 With one Lyapunov matrix the inequality at a mean of vertices is the mean of theirs.  With it the same problem has
 another centre, and a solver ends at other gains: a redundant vertex shall change no design.  Gains there are the same

@@ -1,4 +1,4 @@
-"""Designs that leave sensors out, as candidates beside the one with all: a sensor more then costs no noise.
+"""Designs with fewer sensors as further candidates, so that an additional sensor never increases the noise.
 
 An observer of fewer outputs is one of all with gains of zero.  An objective that does not see the noise, such as the
 size of gains or the conditioning of poles, may give it less noise than the design with all of them.

@@ -1,4 +1,4 @@
-"""Designs whose inequality has the user's own terms: constraints, an objective, a region for the eigenvalues.
+"""Designs with the user's own constraints, objective, or region of eigenvalues in the inequality.
 
 The methods leave these to the problem as it stands in the paper: solved as it is here, gains taken from it, and the
 realisation and certificate of these gains made as for any others.  `verify` knows nothing of how they were found.

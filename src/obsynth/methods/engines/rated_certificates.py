@@ -1,4 +1,4 @@
-"""Gains and Lyapunov matrices for one slow parameter in continuous time that can be proved.
+"""Gains with proved Lyapunov matrices for one parameter with a bounded rate, in continuous time.
 
 ``L(t) = P(t)^-1 Y(t)`` of `obsynth.conditions.rated_inequalities` is no mean of two gains.  What is shipped is: the
 gains at its ends, and what lies between; that is analysed again, with a P(t) of its own, and proved.

@@ -1,4 +1,4 @@
-"""The deviations of fault estimates under noise: of the sensors alone, and of all that a plant states."""
+"""Standard deviations of fault estimates, by sensor noise alone and by all stated noise."""
 
 from __future__ import annotations
 

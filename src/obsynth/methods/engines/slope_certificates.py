@@ -1,4 +1,4 @@
-"""Gains and multipliers of an error system with many slopes that can be proved in one block, without corners.
+"""Gains with a proved certificate for many bounded slopes: one block with a multiplier in place of all corners.
 
 First the least level of the inequality with a diagonal multiplier, then a proof a little above it; what counts is not
 the solver's status but whether `obsynth.proofs.slope_blocks` proves it.  The inequality is sufficient, not necessary:

@@ -1,4 +1,4 @@
-r"""Gains over a region with which no disturbance reaches a fault estimate, in closed form.
+r"""Gains over a region in closed form that decouple the fault estimates from all disturbances.
 
 The errors obey ``e+ = (A_i - R_i C) e + B_i d``, the estimates miss by ``(Cz + V C) e``.  With a basis ``S`` of all
 ``B_i`` for which ``C S`` has full column rank, ``M = (C S)^+`` and N a basis of what is orthogonal to ``C S``,

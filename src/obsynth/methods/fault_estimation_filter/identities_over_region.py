@@ -1,4 +1,4 @@
-"""Rows that every fault-estimation filter over a region has: unbiased, the effect of the faults, the claimed gain."""
+"""Identities of fault-estimation filters over a region: unbiasedness, effectiveness of faults, and the claimed gain."""
 
 from __future__ import annotations
 

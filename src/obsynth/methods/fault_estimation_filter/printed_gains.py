@@ -1,4 +1,4 @@
-"""The gain set beside the realisation, and what the rounding of printed gains can do to each identity.
+"""Printed gains of a filter, and the effect of their rounding on each identity.
 
 Source: Wang 2015, eqs. (8), (17), (20), (23), (60). To first order an identity at gains printed to k decimals is off by
 half a unit times the sizes of its cofactors, each found by moving an entry of the gains by as much, either way.

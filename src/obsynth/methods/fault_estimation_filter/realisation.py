@@ -1,4 +1,4 @@
-"""The shipped realisation of a fault-estimation filter, from T, N, L and W: those of synthesis, or given ones.
+"""The shipped realisation of a fault-estimation filter from T, N, L and W, computed or given.
 
 Source: Wang 2015, eqs. (19), (20), (23).  Differences: ``D u`` is subtracted from the outputs; the state estimate,
 which the paper leaves biased by Psi under a constant fault, is corrected by the fault estimate: max(rho) - 1 late.

@@ -1,4 +1,4 @@
-"""The search for the gains of a fault-estimation filter: the least gain, the one to ship, and small gains for it."""
+"""Search for the gains of a fault-estimation filter: the least gain, a gain to ship, and small matrices for it."""
 
 from __future__ import annotations
 

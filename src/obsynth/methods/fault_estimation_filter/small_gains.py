@@ -1,4 +1,4 @@
-"""The second stage: of all filters that reach a gain, one with small gains or little noise.
+"""The second stage of synthesis: small gains or little noise among all filters that reach a gain.
 
 No number of a solver is believed: the true gain, the true variance and the spectral radius of the closed loop decide.
 """

@@ -1,4 +1,4 @@
-"""Checks of a filter of faults that turn with the scheduling, from the plant and the shipped realisation alone.
+"""Checks of filters for faults whose direction changes with the scheduling, from plant and realisation alone.
 
 With ``r = -Cr e`` the error ``e = T E x - z`` is corrected to ``eps = (I + K(mu) Cr) e``, K at the weights with which z
 was formed, so that ``eps+ = (I + K(mu) Cr) (Az(mu) eps + T Bf(mu) f + T Bd(mu) d)``, and the fault rows are

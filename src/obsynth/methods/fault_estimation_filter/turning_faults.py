@@ -1,4 +1,4 @@
-"""The fault-estimation filter of faults that turn with the scheduling: a correction that turns with them, two vertices.
+"""Fault-estimation filters for faults whose direction changes with the scheduling, by a correction; two vertices.
 
 ``z+ = T A(mu) xhat + T B(mu) u`` with ``xhat = z + N y + K(mu) r``, ``r = y - C (z + N y)``, K at the weights of the
 sample before: those with which z was formed.  Its error is that of `obsynth.analysis.existence.turning_filter`, and

@@ -1,4 +1,4 @@
-"""The free residual weight W against the paper's: gains and noise with each."""
+"""The free residual weight W compared with the paper's: gain and noise with each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole transfer from the faults, and the filter of a set of gains: a second route to synthesis.
+"""The complete transfer function from the faults, as a second route to the results of synthesis.
 
 The error's response to an impulse is followed for one step more than the largest delay; zero from there on makes the
 transfer complete. The equations (Wang 2015, eq. (23)) are run on unit vectors: ``x0 = z + N y``, ``z+ = T A x0 + L (y -

@@ -1,4 +1,4 @@
-"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; gains without T and T0."""
+"""Checks of a functional filter, from plant, realisation, T and T0; its gains are checked without T and T0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The models that the gains of a functional filter are for: noise, and the groups of faults that one filter serves."""
+"""Filter models for the gains of a functional filter: noise, and groups of faults that share one filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filter models (a plant without unknown inputs, fault models on it) and their Kalman gains, for a fixed lag too.
+"""Kalman gains for filter models (decoupled plant with fault models), also with a fixed lag.
 
 A decoupled plant is driven by y itself, so the same noise stands in its states and in its outputs.
 """

@@ -1,4 +1,4 @@
-"""Random-walk intensity of a fault that is not stated: slowly, but so that a step is seen in the plant's own time.
+"""Default random-walk intensity of a fault: small, but a step shows within the plant's settling time.
 
 And the deviation against the delay: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C
 M_j`` from the error covariance.

@@ -1,4 +1,4 @@
-"""The error system of a functional filter: faults that follow their models, deviations by noise and by walks."""
+"""The error system of a functional filter: exact fault models, and deviations by noise and random walks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding a bank of guaranteed tests: for each fault the smallest group that can be isolated, and the least
+"""Synthesis of a bank of guaranteed tests: for each fault the smallest group that can be isolated, and the least
 threshold.
 """
 

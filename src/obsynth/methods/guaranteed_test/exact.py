@@ -1,4 +1,4 @@
-"""The least interval of the fault that the samples of a window allow, and the least test where samples are missing.
+"""The exact interval of a fault that the samples of a window allow, and the least test with missing samples.
 
 Both are linear programmes, solved by HiGHS from the basis of the window without data, so that a row is the same
 wherever a run begins.  Only what is then proved of their multipliers counts: with multipliers mu that give the fault

@@ -1,4 +1,4 @@
-"""Whether a window tells a fault: proved by numbers that hide it, or by a test that finds it."""
+"""Whether a window of samples can detect a fault: proved by a fault that no sample shows, or by a test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guaranteed tests of nonlinear plants: of the sampled linear model, with its remainder as a disturbance."""
+"""Guaranteed tests of nonlinear plants: the sampled linear model, with its remainder as a disturbance."""
 
 from __future__ import annotations
 

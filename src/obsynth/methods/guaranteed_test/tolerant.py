@@ -1,4 +1,4 @@
-"""Tests of plants whose constants have tolerances: an observer of the state beside the test, weights for a scenario.
+"""Tests for plants whose constants have tolerances: with an observer of the state, and weights for a scenario.
 
 What tolerances do is linear in the weights: ``(E(q) - E) x(k+1) - (A(q) - A) x(k) - (B(q) - B) u(k)`` at the samples of
 a record, where x is what the observer beside says, less its error, which is bounded.  Each such column counts with its

@@ -1,4 +1,4 @@
-"""Witnesses of an optimal filter's claims: P of its gain, and the points of what no output shows."""
+"""Certificate of an optimal filter: P for its gain, and complex points at which invisible signals bound every gain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""T and B of a filter, corrected together where one of them has lost digits.
+"""Joint correction of T and B of a filter where one of them has lost digits.
 
 A filter of least gain comes with a B that is right but for rounding, and a T that follows that B.  Where what rounding
 makes of B reaches an estimate that nothing else does, or of faults that the outputs hardly show, no other T takes it

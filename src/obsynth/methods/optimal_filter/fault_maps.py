@@ -1,4 +1,4 @@
-"""The fault maps that the options leave open, and the filter of least gain for each of them."""
+"""Fault maps that the options leave free, and the filter of least gain for each of them."""
 
 from __future__ import annotations
 

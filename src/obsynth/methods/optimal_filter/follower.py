@@ -1,4 +1,4 @@
-"""A filter that reads y alone, with the matrices T and T0 that show what it follows of the plant."""
+"""Filters that read y alone, with matrices T and T0 that relate the filter's state to that of the plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modes that last and that no noise drives: integrators of a constant, oscillations that go on.
+"""Undamped modes without noise: integrators of a constant, and oscillations.
 
 Their part of the error decays only where the filter reads them, which costs noise: where they are on the boundary of
 stability, no stable filter reaches the least gain of all causal ones, and some come as near as one likes.  Beyond it

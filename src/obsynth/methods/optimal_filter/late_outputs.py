@@ -1,4 +1,4 @@
-"""Whether a filter shows inputs of later samples, and a sampled plant whose outputs come some samples late."""
+"""Delayed outputs: a sampled plant with late outputs, and whether a filter needs inputs of later samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a filter of continuous time passes at once, so that no white noise passes to the error but by rounding.
+"""Direct feedthrough of a continuous filter, corrected such that no white noise passes to the error.
 
 Of signals of ever higher frequency an output shows ``N v``, v all that drives the plant, and the error of an estimate
 ``D y`` is ``(D N - M) v``, M the reference model at infinity.  A design has ``D N = M`` but for rounding, beside which

@@ -1,4 +1,4 @@
-"""The realisation of an optimal filter from u and y, and the matrices T and T0 that show what it follows.
+"""The realisation of an optimal filter from u and y, with T and T0, which relate its state to the plant's.
 
 The filter of least gain reads y alone.  Its state follows ``T E x`` where nothing but u acts, which gives what u adds;
 modes of the plant that die out by themselves and that it reads are followed by a copy that only u drives.

@@ -1,4 +1,4 @@
-"""Reference models, from the faults to their wanted estimate, as matrices."""
+"""Reference models of fault estimates as matrices: the desired response to each fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The optimal filter: the delay, the filter of least gain, and what proves it."""
+"""Synthesis of the optimal filter: the delay, the filter of least gain, and its certificate."""
 
 from __future__ import annotations
 

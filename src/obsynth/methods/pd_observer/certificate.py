@@ -1,4 +1,4 @@
-"""A certificate of Theorem 1 for gains in hand, without a solver.
+"""Certificate of Theorem 1 for given gains, without a solver.
 
 A solution P1, P3 exists for every delta > 0 (elimination lemma): P1 from a Lyapunov equation, and in coordinates in
 which the factors around P3 are unit columns, P3 cancels its off-diagonal block.

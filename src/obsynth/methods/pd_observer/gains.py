@@ -1,4 +1,4 @@
-"""Gains of a PD observer with their realisation and a certificate that is proved."""
+"""Gains of a PD observer with realisation and proved certificate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PD observers whose gains are given; and the gain G of the loop, checked."""
+"""PD observers with given gains, and checks of the gain G of the loop."""
 
 from __future__ import annotations
 

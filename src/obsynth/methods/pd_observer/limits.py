@@ -1,4 +1,4 @@
-"""Time scales of a PD observer, and what of its options is proved impossible before a solver runs."""
+"""Time scales of a PD observer, and options that are proved impossible before a solver runs."""
 
 from __future__ import annotations
 

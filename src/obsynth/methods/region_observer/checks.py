@@ -1,4 +1,4 @@
-"""Checks of an observer over a region of a nonlinear plant, from the texts of its equations and the shipped numbers."""
+"""Checks of an observer over a region of a nonlinear plant, from the equations and the shipped numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decoupling of a shipped observer, measured as a transfer function from the plant itself, without its tracking map.
+"""Decoupling of a shipped observer, computed as a transfer function from the plant, without its tracking matrix.
 
 At each frequency the trajectories ``(x, d) e^{st}`` of the plant are the null space of ``[sE - A, -Bd]``, whether the
 plant is regular or not.  Through ``y = C x + Dd d`` and the realisation they give estimates, whose errors must vanish.

@@ -1,4 +1,4 @@
-"""Estimates of faults that a fault model does not describe: fhat/f, steady errors, and limits of any gain.
+"""Response to faults outside the fault model: fhat/f, steady errors, and limits that hold for any gain.
 
 For any fault, fhat = T(s) f once the initial-condition response has settled.  At a zero of (f, d) -> y outside the
 region of stability T(s) f0 = 0 for every stable decoupled observer: a step is then first answered in the wrong

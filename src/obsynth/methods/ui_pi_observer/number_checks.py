@@ -1,4 +1,4 @@
-"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise; and the letters of its gains."""
+"""Recomputed numbers of a shipped observer: stability, poles, rates, digits, noise; and its listed gains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gains of a recursive observer, step by step: they do not depend on data."""
+"""The gains of a recursive observer step by step, computed before any data."""
 
 from __future__ import annotations
 

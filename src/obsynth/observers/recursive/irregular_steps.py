@@ -1,4 +1,4 @@
-"""Steps of a recursive observer over intervals of any length, from the continuous plant behind its model.
+"""Steps of a recursive observer over intervals of any length, from the continuous plant.
 
 A filter on samples of one length has one transition and one covariance of the process noise. Over another interval both
 follow from the continuous plant, and a filter with these takes that step: the state of the recursion is the same.

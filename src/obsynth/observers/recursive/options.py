@@ -1,4 +1,4 @@
-"""A recursive observer from the options of a method: used to design one, and to check the one that was shipped."""
+"""Recursive observers from the options of a method, for design and for verification."""
 
 from __future__ import annotations
 

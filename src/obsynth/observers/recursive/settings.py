@@ -1,4 +1,4 @@
-"""The recursive observer: plant, noise, start, and how parameters are estimated, all checked."""
+"""The fields of a recursive observer: plant, noise, initial values, and how parameters are estimated; checked."""
 
 from __future__ import annotations
 

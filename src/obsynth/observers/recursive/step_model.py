@@ -1,4 +1,4 @@
-"""The matrices of one step as the recursion needs them: of a plant as it is, with early constraints, with walks.
+"""The matrices of one step of the recursion: of a plant as it is, with early constraints, or with random walks.
 
 Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
 """

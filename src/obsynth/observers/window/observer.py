@@ -1,4 +1,4 @@
-"""A weighted sum of the last samples, with weights of its own at each row."""
+"""Observers as weighted sums of the last samples, with weights that depend on the number of the row."""
 
 from __future__ import annotations
 

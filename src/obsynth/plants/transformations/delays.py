@@ -1,4 +1,4 @@
-"""Plants without delays from plants with delays: exactly on samples, by Pade approximations in continuous time."""
+"""Plants with delays as plants without: exact for whole samples, by Pade approximations in continuous time."""
 
 from __future__ import annotations
 

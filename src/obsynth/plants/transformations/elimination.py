@@ -1,4 +1,4 @@
-"""Solving the algebraic equations of a plant: at index 1 as they are, above it by `index_reduction`."""
+"""Elimination of a plant's algebraic states: directly at index 1, by `index_reduction` above."""
 
 from __future__ import annotations
 

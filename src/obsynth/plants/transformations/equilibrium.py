@@ -1,4 +1,4 @@
-"""Where a nonlinear plant rests, or the exact reason why it rests nowhere; and consistent points of a motion."""
+"""Equilibria of a nonlinear plant, or the reason why there is none; and consistent points of a trajectory."""
 
 from __future__ import annotations
 

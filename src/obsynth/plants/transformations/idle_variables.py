@@ -1,4 +1,4 @@
-"""Variables that act on nothing (as in filters whose time constants are zero), found by the pattern of a plant.
+"""Variables without effect on a plant, such as filters with zero time constants, found by its sparsity pattern.
 
 No output depends on them nor on what depends on them: they are left out exactly, with as many equations.  With them
 the plant would have index 2, or would not be regular.

@@ -1,4 +1,4 @@
-"""From equations to matrices: exact linear models of nonlinear plants at rest, or at a point of a motion."""
+"""Exact linearisation of nonlinear plants, at an equilibrium or at a point of a trajectory."""
 
 from __future__ import annotations
 

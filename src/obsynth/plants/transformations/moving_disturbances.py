@@ -1,4 +1,4 @@
-"""Disturbances that move between samples: what any course within their bounds puts into the states of a sampled plant.
+"""Disturbances that move between samples: the effects of any time course within bounds on a sampled plant.
 
 .. math::
     q = \\int_0^h e^{A s} B_d d(h - s)\\, ds, \\qquad |d_i(t)| \\le \\bar d_i

@@ -1,4 +1,4 @@
-"""Noise that is not white, offsets of sensors and loads that walk, as states of a plant that every method knows."""
+"""Coloured noise, sensor offsets and random-walk loads as further states of a plant, for use with every method."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The states of a large plant from those that elimination left, as a sparse solution instead of a dense matrix."""
+"""Recovery of a large plant's states after elimination, as a sparse solution instead of a dense matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""A nonlinear plant as its sampled linear model with a bound on what that leaves out, over a region.
+r"""The sampled linear model of a nonlinear plant, with a bound on its error over a region.
 
 The equations are evaluated in affine arithmetic over the region: what is not linear is bounded, with all rounding.
 Between samples it may do anything within its bound:

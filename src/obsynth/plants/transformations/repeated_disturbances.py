@@ -1,4 +1,4 @@
-"""Unknown inputs that depend on others but for rounding, such as one in another unit: they count once.
+"""Unknown inputs that are multiples or combinations of others up to rounding: they are removed.
 
 ``[Bd; Dd]`` with a column that is three times another one has rank one more than it means to: rounding of the product
 makes them independent, and an observer that must decouple both has a sensor less than it needs.

@@ -1,4 +1,4 @@
-"""Solving the algebraic equations of a large index-1 plant by its sparsity."""
+"""Elimination of the algebraic states of a large index-1 plant, by its sparsity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Estimates of faults, parameters and states on the truth, and residuals against thresholds."""
+"""Plots of estimates of faults, parameters and states with the true values, and of residuals with thresholds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of guaranteed tests: how small a fault so many samples tell, and the interval in which it lies."""
+"""Plots of guaranteed tests: the least fault against the number of samples, and the interval of a fault."""
 
 from __future__ import annotations
 

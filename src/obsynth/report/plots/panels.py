@@ -1,4 +1,4 @@
-"""Panels one above the other, and styles that differ by more than their colour, so that pictures can be printed."""
+"""Plot panels one above the other, with line styles that differ by more than colour, for print."""
 
 from __future__ import annotations
 

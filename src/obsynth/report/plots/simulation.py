@@ -1,4 +1,4 @@
-"""Pictures of a simulation: faults against estimates, statistics of monitors, and decisions."""
+"""Plots of a simulation: faults with estimates, statistics of monitors, and decisions."""
 
 from __future__ import annotations
 

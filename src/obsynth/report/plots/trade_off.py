@@ -1,4 +1,4 @@
-"""Pictures of trade-offs: one claim against another, a delay, a region, a rate or a swept entry."""
+"""Plots of trade-offs: one claim against another, a delay, a region, a rate or a swept option."""
 
 from __future__ import annotations
 

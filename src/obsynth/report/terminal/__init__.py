@@ -1,1 +1,1 @@
-"""The command line as its verbs share it: arguments, texts and files, whatever room a verb belongs to."""
+"""Shared parts of the command line for the verbs of all rooms: arguments, output, files."""

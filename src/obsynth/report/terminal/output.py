@@ -1,4 +1,4 @@
-"""What goes to the terminal and into files: reports on stdout, progress and errors on stderr, JSON for programs."""
+"""Terminal output: reports on stdout, progress and errors on stderr, JSON for programs."""
 
 from __future__ import annotations
 

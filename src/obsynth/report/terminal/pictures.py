@@ -1,4 +1,4 @@
-"""Files of pictures."""
+"""Picture files of the command line."""
 
 from __future__ import annotations
 

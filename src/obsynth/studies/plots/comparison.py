@@ -1,4 +1,4 @@
-"""The picture of a comparison: responses to steps, and estimates on the scenario."""
+"""Plot of a comparison: responses to steps, and estimates on the scenario."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a study of tolerances."""
+"""Plot of a tolerance study."""
 
 from __future__ import annotations
 

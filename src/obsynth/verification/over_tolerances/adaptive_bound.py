@@ -1,4 +1,4 @@
-"""A bound of residuals and fault estimates over the box of the plant's constants.
+"""Bound on residuals and fault estimates over the box of the plant's constants.
 
 The bound at sample k is ``nominal + start_k + sum_i |phi_i| + rest_k + rounding_k``: ``nominal`` of disturbances and
 noise, ``start_k`` of the error at the start, ``phi_i`` filters of the measured signals, one for each constant (first

@@ -1,4 +1,4 @@
-"""How an uncertain plant drives the error of a fixed observer.
+"""How an uncertain plant drives the estimation error of a given observer.
 
     eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d,   eps = z - T E(q) x
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)

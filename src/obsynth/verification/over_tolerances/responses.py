@@ -1,4 +1,4 @@
-"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close."""
+"""Responses of an observer's error to its inputs: finite sums with a proved tail, and the feedback between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a plant is stable and of index 1 at every point of a box: it is cut until each part is proved or refuted."""
+"""Stability and index 1 of a plant at every point of a box, by subdivision until each part is decided."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Monte Carlo on the plant's own model: are the errors as large as the covariances say, and the innovations white?
+"""Consistency by Monte Carlo on the plant's model: sizes of errors against covariances, whiteness of innovations.
 
 Errors of a linear estimator do not depend on the trajectory: on the one that is zero the *prior mean* is random.  To
 draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of an algebraic equation depends on x(k).

@@ -1,4 +1,4 @@
-"""Proofs on a recursive observer in outward rounding: on its gains as computed, for the stated plant.
+"""Proofs on the computed gains of a recursive observer over a horizon, for the stated plant, in outward rounding.
 
 With gains ``[L_k K_k]``, ``H_k = [E_k; C_k]``: ``e_k = L_k A e_(k-1) + ([L_k K_k] H_k - I) x_k`` and noise.  Proved:
 the last term is rounding ("unbiased"), products of ``L_k A`` shrink ("contraction"), the covariance is definite.

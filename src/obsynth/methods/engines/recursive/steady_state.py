@@ -1,4 +1,4 @@
-"""Proofs on the last listed gains of a recursive observer, used as constant gains, where plant and noise are constant.
+"""Proofs on the last gains of a recursive observer as constant gains, for plants with constant matrices and noise.
 
 The gains make errors of mean zero, errors decay, and the covariance that they reach is enclosed: the filter's own,
 whose gains move on, ends at or below it.

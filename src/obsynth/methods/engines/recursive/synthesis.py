@@ -1,4 +1,4 @@
-"""Functions of all recursive methods: noise that the plant states, gains to read, claims, notes."""
+"""Shared steps of recursive methods: stated noise, printed gains, claims, notes."""
 
 from __future__ import annotations
 
