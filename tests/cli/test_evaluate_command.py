@@ -181,3 +181,46 @@ def test_a_monitor_that_makes_no_sense_is_refused_before_anything_is_written(
     assert main(["run", "--gains", gains, "--data", "log.csv", "--out", "out.csv", *more]) == 2
     assert message in capsys.readouterr().err
     assert not Path("out.csv").exists()
+
+
+LAG = (
+    "schema_version: 1\nname: lag\n"
+    "plant: {dt: 1.0, A: [[0.9]], C: [[1.0], [1.0]], Bf: [[1.0]], sensor_noise: {y1: 0.1, y2: 0.1}}\n"
+    "method: {id: fault-estimation-filter}\n"
+)
+
+
+def test_a_plant_without_disturbances_has_no_sentence_on_them(tmp_path, capsys):
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(LAG + "scenario: {horizon: 40, noise: 1}\n")
+    assert main(["evaluate", "--system", str(spec), "--runs", "2", "--quiet"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "if the model is exact, with noise within 3 standard deviations, |estimate of f1| <=" in printed
+    assert "disturbances" not in printed
+
+
+def test_errors_before_the_start_is_forgotten_are_not_called_after_warm_up(tmp_path, capsys):
+    """`simulate` said that the response to the start had not settled, `evaluate` that errors came after warm-up."""
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(
+        "schema_version: 1\nname: slow\nplant: {dt: 1.0, A: [[0.999]], C: [[1.0]], Bf: [[1.0]], sensor_noise: {y1: 1}}\n"
+        "method: {id: functional-filter, options: {fault_rate: 1.0e-5}}\nscenario: {horizon: 20, noise: 1}\n"
+    )
+    assert main(["evaluate", "--system", str(spec), "--runs", "2", "--quiet"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "the initial-condition response has not settled: errors of the whole record" in printed
+    assert "warm-up" not in printed
+
+
+def test_what_a_recursive_design_estimates_are_parameters(tmp_path, capsys):
+    """`simulate` named them so, `evaluate` called them faults."""
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(
+        LAG.replace("fault-estimation-filter", "adaptive-observer, options: {Q: 0.01, forgetting: 0.95}")
+        + "scenario: {horizon: 20, noise: 1}\n"
+    )
+    for command in (["simulate"], ["evaluate", "--runs", "2"]):
+        assert main([*command, "--system", str(spec), "--quiet"]) == 0
+        printed = capsys.readouterr().out
+        assert "Parameter estimates" in printed
+        assert "Fault estimates" not in printed

@@ -21,6 +21,9 @@ ROUNDING_SHARE = 1e-13
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN_ROWS = 12
 
+#: Of which rows errors are where the record ends before the start is forgotten.
+NOT_SETTLED = "the initial-condition response has not settled: errors of the whole record"
+
 
 def worst_rows(title: str, rows: list[Any], size: Callable[[Any], float]) -> tuple[str, list[Any]]:
     """Return title and rows of a table; of many the worst."""
@@ -67,7 +70,7 @@ def simulation_report(
             table.add_row(Text(signal), rmse, largest, last, Text(units.get(signal, "")))
         remark = "errors of the whole record"
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
-            remark = "the initial-condition response has not settled: errors of the whole record"
+            remark = NOT_SETTLED
         elif linear:
             remark = f"errors from {duration(end)} on, when less than {WARM_UP_SHARE * 100:g} % of the start is left"
         print_section(console, f"{title} ({remark})", table)

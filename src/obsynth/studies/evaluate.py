@@ -115,6 +115,11 @@ class Evaluation:
     fault_rmse, state_rmse : mapping of str to Interval
         Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
         uncertain they are from the start, over the whole record but its first row.
+    fault_warm_up, state_warm_up : float or None
+        Seconds after which less than 1 % of the start is left in the estimates, and errors count; ``None`` where the
+        record ends before that: errors are of all its rows.
+    recursive : bool
+        Whether the design is recursive: what it estimates as faults are parameters of the plant.
 
     Examples
     --------
@@ -141,6 +146,9 @@ class Evaluation:
     isolation_error_rate: Interval
     fault_rmse: Mapping[str, Interval]
     state_rmse: Mapping[str, Interval]
+    fault_warm_up: float | None = None
+    state_warm_up: float | None = None
+    recursive: bool = False
 
     def __repr__(self) -> str:
         """Return rates, delays and errors as tables."""
@@ -262,14 +270,14 @@ def evaluate(
     benches = [make_bench(variant, scenario) for variant in designs] or [bench]
     size = max(1, BATCH_SAMPLES // bench.signals.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
-    states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
+    ends = (1, 1) if isinstance(bench.observer, (RecursiveObserver, DAEObserver)) else bench.warm_ups()
     names = design.linear[0].fault_names if isinstance(bench.observer, LinearObserver) else ()
     tasks = [
         (own_bench, tuple(seeds[i] for i in part[begin : begin + size]))
         for own_bench, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
         for begin in range(0, len(part), size)
     ]
-    work = partial(_run, watched=monitor, warm_ups=(states, faults), fault_names=names)
+    work = partial(_run, watched=monitor, warm_ups=(ends[0] or 0, ends[1] or 0), fault_names=names)
     results, finished = [dict[str, FloatArray]() for _ in tasks], 0
     with progress_of_runs(progress) as report_runs:
         for i, batch in as_they_come(work, tasks, executor):
@@ -277,7 +285,7 @@ def evaluate(
             if report_runs is not None:
                 report_runs(finished, runs)
     parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
-    return _evaluation(parts, design, bench, watched=monitor is not None, level=confidence)
+    return _evaluation(parts, design, bench, ends, watched=monitor is not None, level=confidence)
 
 
 def _require_fit(
@@ -345,9 +353,16 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
 
 
 def _evaluation(
-    parts: Mapping[str, FloatArray], design: ObserverDesign, bench: Bench, *, watched: bool, level: float
+    parts: Mapping[str, FloatArray],
+    design: ObserverDesign,
+    bench: Bench,
+    ends: tuple[int | None, int | None],
+    *,
+    watched: bool,
+    level: float,
 ) -> Evaluation:
     onset = bench.onset
+    states, faults = (None if end is None else end * bench.signals.dt for end in ends)
     runs, observer = len(parts["false"]), design.observer
     detected, judged = ~np.isnan(parts["alarm"]), ~np.isnan(parts["wrong"])
     counted = runs if watched else 0
@@ -366,4 +381,7 @@ def _evaluation(
         isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
         fault_rmse=errors("faults", observer.fault_names),
         state_rmse=errors("states", observer.state_names),
+        fault_warm_up=faults,
+        state_warm_up=states,
+        recursive=isinstance(bench.observer, (RecursiveObserver, DAEObserver)),
     )

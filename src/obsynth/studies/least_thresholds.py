@@ -162,29 +162,31 @@ def in_words(
     least: float,
     unit: str = "",
     *,
+    disturbed: bool = True,
     moving: bool = False,
     noisy: bool = False,
     samples: int = LONGEST_WINDOW,
 ) -> str:
-    """Return a sentence on one fault; ``moving``: whether disturbances move between samples; ``noisy``: whether the
-    plant has noise, which counts as within `DEVIATIONS`; ``samples``: of the tests, see `window_length`."""
+    """Return a sentence on one fault; ``disturbed``: whether plant and scenario have disturbances; ``moving``: whether
+    those move between samples; ``noisy``: whether the plant has noise, which counts as within `DEVIATIONS`;
+    ``samples``: of the tests, see `window_length`."""
     size = f"{upper_number(bound, digits=3)}{f' {unit}' if unit else ''}"
-    motion = "move within their bounds" if moving else "are held"
-    noise = (
-        f" (those of the scenario; noise within {DEVIATIONS:g} standard deviations)"
-        if noisy
-        else " (those of the scenario)"
-    )
+    motion = f"{'move within their bounds' if moving else 'are held'} between samples"
+    assumed = f" and disturbances {motion} (those of the scenario)" if disturbed else ""
+    noise = f", with noise within {DEVIATIONS:g} standard deviations" if noisy else ""
     own = (
-        f"Fault-free, once the start has died out, if the model is exact and disturbances {motion} between "
-        f"samples{noise}, |estimate of {fault}| <= {size}"
+        f"Fault-free, once the start has died out, if the model is exact{assumed}{noise}, |estimate of {fault}| "
+        f"<= {size}"
     )
+    acting = [name for name, acts in (("disturbances", disturbed), ("noise", noisy)) if acts]
+    if not acting:
+        return f"{own}: the scenario has neither disturbances nor noise."
     if not np.isfinite(least):
         return f"{own}. The smallest possible threshold is not known."
     if bound == 0.0:
-        return f"{own}, as neither disturbances nor noise of the scenario reach it."
+        return f"{own}: the {' and '.join(acting)} of the scenario do not reach it."
     if least <= SAME_RESPONSE * bound:
-        return f"{own}. A test immune to the disturbances and noise of the scenario exists (guaranteed-test)."
+        return f"{own}. A test immune to the {' and '.join(acting)} of the scenario exists (guaranteed-test)."
     if bound < least:
         return (
             f"{own}: less than any test with its delay on at most {samples} samples of inputs and outputs has "
@@ -216,6 +218,12 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
     except ObsynthError:
         return {}
     return {name: pair for name, pair in zip(observer.fault_names, pairs, strict=True) if np.isfinite(pair[0])}
+
+
+def is_disturbed(design: ObserverDesign, scenario: Scenario) -> bool:
+    """Whether the scenario has a disturbance of the plant of a design."""
+    plant, _ = design.linear
+    return bool(plant.nd) and bool(largest_disturbances(scenario, plant.disturbance_names, plant.dt).any())
 
 
 def is_moving(design: ObserverDesign) -> bool:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
-from obsynth.report.scenarios import worst_rows
+from obsynth.report.scenarios import NOT_SETTLED, worst_rows
 from obsynth.results.layout import headed_table, number, print_section, printed
 
 if TYPE_CHECKING:
@@ -64,10 +64,8 @@ def evaluation_report(
     console: Console,
     units: Mapping[str, str],
     beside: Sequence[str] = (),
-    from_the_start: bool = False,
 ) -> None:
-    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds; ``from_the_start``: whether
-    errors are of all rows but the first, as those of recursive designs."""
+    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
     share = f"{100.0 * evaluation.confidence:g} % interval"
     console.print(Text(f"{name}: {evaluation.runs} runs", style="bold"))
     console.print()
@@ -88,14 +86,19 @@ def evaluation_report(
         console.print()
     for sentence in beside:
         console.print(Text(sentence))
-    for title, errors in (("Fault estimates", evaluation.fault_rmse), ("State estimates", evaluation.state_rmse)):
+    estimates = "Parameter" if evaluation.recursive else "Fault"
+    for title, errors, warm_up in (
+        (f"{estimates} estimates", evaluation.fault_rmse, evaluation.fault_warm_up),
+        ("State estimates", evaluation.state_rmse, evaluation.state_warm_up),
+    ):
         if errors:
-            since = "from row 1 on" if from_the_start else "after warm-up"
-            table = headed_table("signal", f"RMSE {since}", share, "unit")
+            since = "from row 1 on" if evaluation.recursive else "after warm-up"
+            table = headed_table("signal", "RMSE" if warm_up is None else f"RMSE {since}", share, "unit")
             title, rows = worst_rows(title, list(errors.items()), lambda row: row[1].value)
             for signal, item in rows:
                 table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
-            print_section(console, f"{title} (mean over runs, against the signals of their time)", table)
+            of = "" if warm_up is not None else f"; {NOT_SETTLED}"
+            print_section(console, f"{title} (mean over runs, against the signals of their time{of})", table)
 
 
 def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:

@@ -92,7 +92,6 @@ def _tolerance(text: str) -> float | str:
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
-    from obsynth.observers.linear.observer import LinearObserver
     from obsynth.studies.evaluate import evaluate
     from obsynth.studies.tables import evaluation_report
 
@@ -134,7 +133,6 @@ def run_evaluate(options: argparse.Namespace) -> int:
             console=stdout_console(),
             units=design.plant.units,
             beside=sentences,
-            from_the_start=not isinstance(design.observer, LinearObserver),
         ),
     )
     return 0
@@ -179,7 +177,13 @@ def _monitor_data(watched: Monitor | ParameterMonitor | None) -> dict[str, Any] 
 
 def _least_thresholds(design: ObserverDesign, scenario: Scenario) -> tuple[dict[str, Any], list[str]]:
     """Return each fault's bound beside the least possible one, as data and as sentences."""
-    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving, window_length
+    from obsynth.studies.least_thresholds import (
+        design_beside_least,
+        in_words,
+        is_disturbed,
+        is_moving,
+        window_length,
+    )
 
     least = design_beside_least(design, scenario)
     if not least:
@@ -187,7 +191,12 @@ def _least_thresholds(design: ObserverDesign, scenario: Scenario) -> tuple[dict[
     (plant, _), units, moving = design.linear, design.plant.units, is_moving(design)
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     data = {name: {"bound": bound, "least": lowest, "moving": moving} for name, (bound, lowest) in least.items()}
-    settings: dict[str, Any] = {"moving": moving, "noisy": noisy, "samples": window_length(plant)}
+    settings: dict[str, Any] = {
+        "disturbed": is_disturbed(design, scenario),
+        "moving": moving,
+        "noisy": noisy,
+        "samples": window_length(plant),
+    }
     sentences = [in_words(name, *pair, units.get(name, ""), **settings) for name, pair in least.items()]
     return data, sentences
 
