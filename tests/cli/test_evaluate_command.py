@@ -203,7 +203,8 @@ def test_errors_before_the_start_is_forgotten_are_not_called_after_warm_up(tmp_p
     """`simulate` said that the response to the start had not settled, `evaluate` that errors came after warm-up."""
     spec = tmp_path / "spec.yaml"
     spec.write_text(
-        "schema_version: 1\nname: slow\nplant: {dt: 1.0, A: [[0.999]], C: [[1.0]], Bf: [[1.0]], sensor_noise: {y1: 1}}\n"
+        "schema_version: 1\nname: slow\n"
+        "plant: {dt: 1.0, A: [[0.999]], C: [[1.0]], Bf: [[1.0]], sensor_noise: {y1: 1}}\n"
         "method: {id: functional-filter, options: {fault_rate: 1.0e-5}}\nscenario: {horizon: 20, noise: 1}\n"
     )
     assert main(["evaluate", "--system", str(spec), "--runs", "2", "--quiet"]) == 0

@@ -367,3 +367,44 @@ def test_variances_in_a_list_are_answered_with_a_diagonal() -> None:
     plant = obsynth.DescriptorSystem(A=[[0.5, 0], [0, 0.4]], C=[[1, 0], [0, 1]], dt=1.0)
     with pytest.raises(obsynth.SpecError, match=r"or Q=numpy\.diag\(\[1, 2\]\) for a diagonal"):
         obsynth.descriptor_kalman(plant, Q=[1, 2])
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "message"),
+    [
+        ("check", "m.csv", "is a log (a table), not a spec (YAML or JSON). Logs are given with --data"),
+        ("check", "m.xlsx", "is a log (a table), not a document of text. Logs are given with --data"),
+        ("check", "m.mat", "is a file of MATLAB, not a document of text. A model in it is read in Python"),
+        ("check", "A.mtx", "is a matrix, not a spec (YAML or JSON)."),
+        ("verify", "m.csv", "is a log (a table), not a file that obsynth wrote (JSON)."),
+        ("verify", "observer.c", "is C code, not a file that obsynth wrote (JSON)."),
+        ("verify", "proof.json", "is a proof, not a gain set. Check it by `obsynth verify"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(
+    command: str, name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A log given for a spec was told that its top level must be a mapping."""
+    contents = {
+        ".csv": b"time,u\n0.0,1.0\n",
+        ".xlsx": b"PK\x03\x04\xff",
+        ".mat": b"MATLAB 5.0 \xff",
+        ".mtx": b"%%MatrixMarket matrix coordinate real general\n1 1 1\n1 1 1\n",
+        ".c": b"enum { TESTS = 1 };\n",
+        ".json": b'{"format":"obsynth-proof","version":1}',
+    }
+    file = tmp_path / name
+    file.write_bytes(contents[file.suffix])
+    assert main([command, "--system" if command == "check" else "--gains", str(file)]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_level_with_its_unit_is_answered_by_the_number_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gains = tmp_path / "wang.gains.json"
+    assert main(["design", "--system", str(WANG), "--output", str(gains), "--quiet"]) == 0
+    words = ["export", "--gains", str(gains), "--to", str(tmp_path / "o.c"), "--threshold"]
+    assert main([*words, "fhat[actuator 1]=1 V"]) == 2
+    assert "which is not written. Give fhat[actuator 1]=1." in " ".join(capsys.readouterr().err.split())
+    assert main([*words, "fhat[actuator 1]=1"]) == 0

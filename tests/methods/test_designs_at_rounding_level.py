@@ -143,3 +143,22 @@ def test_gains_that_rounding_moves_too_far_are_refused_with_the_error_that_they_
     assert 1e-3 < design.report["constant fault"].value <= limit
     (instead,) = re.findall(r"([a-z-]+) was tried with its defaults and is verified", str(error.value))
     assert obsynth.design(plant, instead).report.passed
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_nothing_is_said_of_rounding_in_a_steady_state_that_a_plant_has_not(dt: float) -> None:
+    """The angle that a torque turns never stays: what rounding did there was that of the pole."""
+    swing = DescriptorSystem(
+        A=[[0.0, 1.0, 0.0], [-0.3, -0.5, 0.3], [0.1, 0.0, -0.1]],
+        C=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        Bf=[[0.0], [1.0], [0.0]],
+        dt=0.0,
+    )
+    # A rotation that leaves the pole at zero only to rounding.
+    turned, _ = np.linalg.qr(np.array([[1.0, 2.0, 3.0], [0.3, 1.0, 0.2], [0.7, 0.1, 1.0]]))
+    plant = swing.replace(A=turned.T @ swing.A @ turned, C=swing.C @ turned, Bf=turned.T @ swing.Bf)
+    if dt:
+        plant = obsynth.discretise(plant, dt).plant
+    design = obsynth.design(plant, "ui-pi-observer")
+    assert "does not settle with such a fault" in design.report["constant fault"].detail
+    assert not any("is constant, rounding" in note for note in design.notes)

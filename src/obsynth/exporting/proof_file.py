@@ -50,10 +50,11 @@ from obsynth.proofs.witnesses import (
 )
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.results.gain_sets import PROOF_FORMAT
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.seen_outputs import seen_plant
 
-PROOF_FORMAT, PROOF_VERSION = "obsynth-proof", 1
+PROOF_VERSION = 1
 #: Shares of the slowest mode's decay that are tried where no claim states one.
 STABILITY_SHARES = (0.9, 0.5, 0.1, 0.01)
 #: An optimal filter's gain that is proved without a P has one a little above: the file states the first that is proved.

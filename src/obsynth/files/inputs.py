@@ -57,6 +57,27 @@ _SPECIAL = {
     stat.S_IFSOCK: "a socket",
 }
 
+#: What files of other kinds are, by their endings.
+_KINDS_BY_SUFFIX = {
+    **dict.fromkeys((".csv", ".tsv", ".xlsx", ".xlsm", ".parquet", ".tdms", ".mf4", ".mdf", ".dat"), "a log (a table)"),
+    ".mat": "a file of MATLAB",
+    ".npz": "a file of numpy",
+    ".mtx": "a matrix",
+    ".fmu": "an FMU",
+    **dict.fromkeys((".c", ".h"), "C code"),
+    **dict.fromkeys((".html", ".htm"), "a page for people to read"),
+}
+
+#: Where a file of another kind belongs, by its ending.
+_PLACES_BY_SUFFIX = {
+    **dict.fromkeys(
+        (".csv", ".tsv", ".xlsx", ".xlsm", ".parquet", ".tdms", ".mf4", ".mdf", ".dat"),
+        "Logs are given with --data, as to `obsynth run`.",
+    ),
+    ".mat": "A model in it is read in Python, by obsynth.from_matlab.",
+    ".fmu": "A model in it is read in Python, by obsynth.from_fmu.",
+}
+
 #: Device and number of each file that the running command has read; `None` outside commands.
 _read: ContextVar[dict[tuple[int, int], Path] | None] = ContextVar("files read", default=None)
 
@@ -157,6 +178,16 @@ def input_file(
     return path
 
 
+def of_another_kind(path: Path, wanted: str) -> str | None:
+    """Return a sentence on a file whose ending says that it is not what is wanted, such as "a spec"; ``None`` where it
+    does not say so."""
+    suffix = path.suffix.lower()
+    if suffix not in _KINDS_BY_SUFFIX:
+        return None
+    place = _PLACES_BY_SUFFIX.get(suffix, "")
+    return f"{path} is {_KINDS_BY_SUFFIX[suffix]}, not {wanted}.{place and ' '}{place}"
+
+
 def suffix_error(path: Path, suffixes: Iterable[str]) -> SpecError:
     """Return the error for a file whose name ends in none of some suffixes."""
     has = "an unknown suffix" if path.suffix else "no suffix"
@@ -185,7 +216,8 @@ def read_text(
             text = stream.read(most + 1)
     except UnicodeDecodeError as error:
         line = _lines_before(path, 4 * most) + 1
-        raise SpecError(f"{path} is no UTF-8 text (line {line}): save it as UTF-8.", path=place) from error
+        damaged = f"{path} is no UTF-8 text (line {line}): save it as UTF-8."
+        raise SpecError(of_another_kind(path, "a document of text") or damaged, path=place) from error
     except (OSError, MemoryError) as error:
         raise SpecError(f"{path} cannot be read: {reason(error)}.", path=place) from error
     if len(text) > most:
@@ -215,10 +247,9 @@ def read_json(
                 f"{path} is a page for people to read. What is verified is the gain set that `obsynth design` wrote "
                 "beside it (.gains.json)."
             )
-        elif path.suffix.lower() == ".csv":
-            problem = f"{path} is a table, not a file that obsynth wrote (JSON)."
         else:
-            problem = f"{path} is not a JSON document ({error})."
+            other = of_another_kind(path, "a file that obsynth wrote (JSON)")
+            problem = other or f"{path} is not a JSON document ({error})."
         raise SpecError(problem, path=place) from error
     return document
 

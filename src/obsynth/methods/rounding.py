@@ -20,6 +20,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.verification.constant_faults import STEADY_ERROR
+from obsynth.verification.settled_faults import SLOWEST_SETTLING, has_steady_state
 
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
 LARGEST_ROUNDED_SHARE = 0.1
@@ -78,8 +79,12 @@ def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) ->
         return
     with np.errstate(all="ignore"):
         shares = rounding_shares(plant, observer, _points(plant)[0])[1]
-    for name, share in zip(plant.fault_names, shares, strict=True):
-        if share >= TOLD_STEADY_ROUNDING:
+    told = [
+        (name, share) for name, share in zip(plant.fault_names, shares, strict=True) if share >= TOLD_STEADY_ROUNDING
+    ]
+    # Of a plant that integrates a fault, which never stays anywhere, the shares are those of rounding in its pole.
+    if told and has_steady_state(plant, observer, SLOWEST_SETTLING):
+        for name, share in told:
             yield (
                 f"While {name!r} is constant, rounding as the observer runs in double precision may move its estimate "
                 f"by about {number(share, digits=2)} times the fault (every rounding at its worst, to first order): "

@@ -45,6 +45,9 @@ GAIN_SET_SUFFIXES = (".gains.json",)
 
 _Made = TypeVar("_Made")
 
+#: What a file of proofs says it is.
+PROOF_FORMAT = "obsynth-proof"
+
 #: How a gain set comes to be: what to do about a file that is none.
 HOW_WRITTEN = "Write one with obsynth design --system SPEC --output FILE, or ObserverDesign.save."
 
@@ -160,6 +163,10 @@ def _read_members(source: Path) -> tuple[Any, bytes | None]:
 
 def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesign:
     """Return the design in a document whose digest is right."""
+    if isinstance(document, dict) and document.get("format") == PROOF_FORMAT:
+        raise SpecError(
+            f"{source} is a proof, not a gain set. Check it by `obsynth verify {source} --independent`.", path=source
+        )
     if not isinstance(document, dict) or document.get("kind") != GAIN_SET_KIND:
         raise SpecError(f"{source} is no gain set of obsynth. {HOW_WRITTEN}", path=source)
     if document.get("schema_version") != GAIN_SET_VERSION:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError, a_kind
-from obsynth.files.inputs import read_json, read_text
+from obsynth.files.inputs import of_another_kind, read_json, read_text
 from obsynth.methods.registry import AUTO, REGISTRY, method_class
 from obsynth.numerics.arguments import field_types, is_number, is_whole
 from obsynth.numerics.suggestions import suggestion
@@ -54,7 +54,10 @@ _KIND = re.compile(r"<\w+>")
 #: Problems of a value that is of another kind, beside those whose names end with `_type`.
 _OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
 
-#: Files that are given for a spec, by their endings.
+#: What documents of YAML are, for those who give something else.
+_WANTED = "a spec (YAML or JSON)"
+
+#: Files of other languages that are given for a spec, by their endings.
 _OTHER_LANGUAGES = {".toml": "TOML", ".py": "Python", ".m": "MATLAB", ".ini": "an INI file", ".txt": "a text"}
 
 
@@ -73,7 +76,8 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
             document = YAML(typ="safe", pure=True).load(text)
         count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:
-        raise SpecError(f"{path} is not valid YAML: {syntax_error(error, text)}", path=place) from error
+        problem = of_another_kind(path, _WANTED) or f"{path} is not valid YAML: {syntax_error(error, text)}"
+        raise SpecError(problem, path=place) from error
     except RecursionError as error:
         raise SpecError(f"{path} is not a valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
@@ -87,6 +91,8 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
     if document is None:
         raise SpecError(f"{path} is empty.", path=place)
     if not isinstance(document, dict):
+        if (problem := of_another_kind(path, _WANTED)) is not None:
+            raise SpecError(problem, path=place)
         other = _OTHER_LANGUAGES.get(path.suffix.lower())
         hint = (
             f" {path.name} is {other}, and a spec is YAML or JSON: write key: value, not key = value." if other else ""

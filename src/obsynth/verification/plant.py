@@ -46,8 +46,11 @@ _SOURCE = "the plant as written, eliminated and sampled again"
 
 _INTERVAL_PARTS = ("midpoint", "radius")
 
-#: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
+#: Terms that are summed up for a row that only informs: the bound on all that follow holds, and is many times wider for
+#: an observer that is slower than that.
 STEPS_OF_INFORMATION = 8_192
+
+_OF_HELD_DISTURBANCES = "what the design claims is of disturbances that are held between samples"
 
 #: The middle plant of the family and the plant of the design differ by rounding: this share of their largest entries.
 FAMILY_TOLERANCE = 1e-9
@@ -244,8 +247,8 @@ def _sampling_rows(
         norm = hinf_norm(observer.Az, t @ root, observer.Cz[rows], np.zeros((len(observer.Cz[rows]), plant.nx)))
         yield information(
             "gain over all d(t)",
-            "l2 gain from disturbances of any time course to the fault error, in the norm h sum r^2 "
-            "over the integral of d^2; gamma is of disturbances that are held between samples",
+            "bound on the l2 gain from disturbances of any time course to the fault error, in the norm h sum r^2 "
+            f"over the integral of d^2; {_OF_HELD_DISTURBANCES}",
             float(np.sqrt(dt) * norm.upper),
             source="lifted system, from an enclosure of its energy",
             detail=f"largest at {norm.frequency:.4g} rad per sample",
@@ -254,8 +257,8 @@ def _sampling_rows(
     peak = _peak_gain(smooth, dt, observer, t, direct)
     yield information(
         "gain over all d(t)",
-        "peak gain from disturbances of any time course to a fault error, |d(t)| <= 1 at all times: a "
-        "disturbance reaches a sample at once, so that its l2 gain is infinite; gamma is of disturbances that are held",
+        "bound on the peak gain from disturbances of any time course to a fault error, |d(t)| <= 1 at all times: a "
+        f"disturbance reaches a sample at once, so that its l2 gain is infinite; {_OF_HELD_DISTURBANCES}",
         peak,
         source="sums over all samples, outward rounded",
     )

@@ -138,9 +138,12 @@ def states_reaching_faults(observer: LinearObserver) -> IntArray:
 def settles(model: ErrorModel, rate: float) -> bool:
     """Return whether the plant's state under constant faults settles: in one over a rate, in samples, or in
     continuous time in decay times of the observer."""
-    plant, observer = model.plant, model.observer
-    if _grows(plant):
-        return False
+    return not _grows(model.plant) and has_steady_state(model.plant, model.observer, rate)
+
+
+def has_steady_state(plant: DescriptorSystem, observer: LinearObserver, rate: float) -> bool:
+    """Return whether there is a state in which the plant stays under constant faults, if an unstable one only where it
+    is held: one with an integrator that a fault drives has none.  ``rate``: as of `settles`."""
     slowest = 1.0
     if plant.dt == 0.0 and observer.order:
         slowest = float(np.min(np.abs(poles_of(observer).real)))

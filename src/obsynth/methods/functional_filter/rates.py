@@ -56,6 +56,9 @@ DECADES, RATE_BISECTIONS = 8, 9
 #: states these take a third of the time.
 ROUGH_FROM = 40
 
+#: Five samples of delay that take less than this share off the deviation are not worth a sentence with figures.
+WORTH_A_DELAY = 0.01
+
 #: What a rough search begins with: no share of noise.
 NO_GAIN = KalmanGain(np.zeros((0, 0)), (), np.zeros((0, 0)))
 
@@ -276,9 +279,12 @@ class DelayCurve:
         rate = self.rates[len(self.rates) // 2]
         at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
         unit = f" {self.unit}" if self.unit else ""
+        walk = f"{self.fault}: for a random walk by {rate:.3g}{unit} per sample"
+        if at[5] > (1.0 - WORTH_A_DELAY) * at[0]:
+            return f"{walk} five samples of delay change the deviation by less than {100.0 * WORTH_A_DELAY:g} %."
         return (
-            f"{self.fault}: for a random walk by {rate:.3g}{unit} per sample one sample of delay takes the deviation "
-            f"from {at[0]:.3g} to {at[1]:.3g}{unit}, five samples to {at[5]:.3g}{unit}."
+            f"{walk} one sample of delay takes the deviation from {at[0]:.3g} to {at[1]:.3g}{unit}, five samples to "
+            f"{at[5]:.3g}{unit}."
         )
 
 

@@ -170,14 +170,14 @@ def linear_plant(source: Any) -> DescriptorSystem:
     plant = source.plant if isinstance(source, Transformation) else source
     if isinstance(plant, DAEModel):
         raise SpecError(
-            "This is for linear plants; of a plant of equations give the linear one that its spec makes with "
-            "transform: {linearise: {at: equilibrium, faults: [...]}}, or obsynth.linearise.",
+            "A linear plant is needed, and this one is nonlinear. Linearise it: transform: {linearise: {at: "
+            "equilibrium, faults: [...]}} in the spec, or obsynth.linearise in Python.",
             path="plant",
         )
     if isinstance(plant, PolytopicSystem):
         raise SpecError(
-            "This is for linear plants that do not change; of a plant over a region (scheduling) give that at one "
-            "point, plant.at({...}), or compare designs by obsynth.simulate.",
+            "A linear plant with constant matrices is needed, and this one has scheduling parameters. Give the plant "
+            "at one of their points, plant.at({...}), or compare designs by obsynth.simulate.",
             path="plant",
         )
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")

@@ -193,7 +193,21 @@ def number_of(name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
+        first, _, unit = text.strip().partition(" ")
+        if unit and _is_number(first):
+            raise SpecError(
+                f"{name}={text}: values are in the unit of their signal, which is not written. Give {name}={first}.",
+                path=name,
+            ) from None
+        raise SpecError(f"{name}={text}: {text!r} is not a number.", path=name) from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
