@@ -408,3 +408,12 @@ def test_a_level_with_its_unit_is_answered_by_the_number_alone(
     assert main([*words, "fhat[actuator 1]=1 V"]) == 2
     assert "which is not written. Give fhat[actuator 1]=1." in " ".join(capsys.readouterr().err.split())
     assert main([*words, "fhat[actuator 1]=1"]) == 0
+
+
+@pytest.mark.parametrize("command", ["compare", "sensors"])
+def test_a_plant_that_changes_with_k_is_told_in_words(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A class of Python was named to somebody who had written a spec."""
+    assert main([command, "--system", str(ROOT / "designs/smib/spec_inertia.yaml"), "--quiet"]) == 2
+    told = capsys.readouterr().err
+    assert "A linear plant with constant matrices is needed, and this one changes with k." in told
+    assert "DescriptorSystem" not in told

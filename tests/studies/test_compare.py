@@ -13,6 +13,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.methods.fault_figures import step_responses
 from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -291,3 +292,27 @@ def test_a_bound_that_is_rounding_is_shown_as_zero() -> None:
     header, row = found.rows()
     assert fault.bound < 1e-12
     assert row[header.index("bound")] == "0"
+
+
+@pytest.mark.long
+def test_what_was_not_followed_is_not_called_never() -> None:
+    """The battery's filter reaches 90 % after 4,855 s, of runs of 3,600 s: the table said never."""
+    spec = load_spec(DESIGNS.parent / "docs/examples/battery/spec.yaml")
+    found = obsynth.compare(
+        spec.transformation, scenario=spec.scenario, methods=["functional-filter", "ui-pi-observer"], runs=2
+    )
+    header, *rows = found.rows()
+    row = next(row for row in rows if row[0] == "functional-filter")
+    assert row[header.index("s to 90 %")] == "> 3600"
+    assert "90 % of a step is not reached within 4,860 s (81 min) by functional-filter" in found.advice
+    plant, observer = found["functional-filter"].design.linear
+    response = step_responses(plant, observer, 1200)[1][:, 0, 0]
+    assert 3600 < 5 * np.argmax(response >= 0.9) < 4860
+
+
+def test_a_small_gain_from_unknown_inputs_is_no_decoupling() -> None:
+    """Of a gain of 8.9e-4 it was said that unknown inputs are decoupled."""
+    plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], Bf=[[1.0]], Bd=[[1e-4]], dt=1.0)
+    found = obsynth.compare(plant, methods=["fault-estimation-filter"], runs=2)
+    assert found.methods[0].faults[0].figures.unknown_input_gain == pytest.approx(1e-4, rel=1e-6)
+    assert "gain from unknown inputs 0.0001" in found.advice

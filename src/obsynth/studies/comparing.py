@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.methods.candidates import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
+from obsynth.methods.candidates import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import agree, design
 from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time
@@ -36,7 +36,7 @@ from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.studies.compared_methods import ComparedMethod, FaultComparison
 from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
-from obsynth.studies.comparison import Comparison
+from obsynth.studies.comparison import ROUNDED_GAIN, Comparison
 from obsynth.studies.equal_delays import (
     HEALTHY_TIME,
     delay_of_scenario,
@@ -301,7 +301,7 @@ def side_by_side(
     return Comparison(
         methods=tuple(compared),
         recommended="" if best is None else best.method,
-        reason=_reason(best, compared, sampled, _method_by_default(candidates, sampled, settling_time(plant))),
+        reason=_reason(best, compared, sampled, _method_by_default(candidates, sampled, settling_time(plant)), limit),
         sample_time=dt,
         times=read_only(record.times),
         truth=read_only(truth),
@@ -491,7 +491,11 @@ def _sized(compared: Sequence[ComparedMethod]) -> list[ComparedMethod]:
 
 
 def _reason(
-    best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem, by_default: str
+    best: ComparedMethod | None,
+    compared: Sequence[ComparedMethod],
+    plant: DescriptorSystem,
+    by_default: str,
+    limit: float,
 ) -> str:
     if best is None:
         return compared[0].refused if compared else "no method was asked for"
@@ -505,12 +509,16 @@ def _reason(
             words[0] += f", against {short_delay(other_designs[0].equal_delay)} by {other_designs[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
-        words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.3g}")
+        words.append(f"gain from unknown inputs {gain:.3g}" if gain > ROUNDED_GAIN else "decoupled from unknown inputs")
     if not best.fast_enough:
         words.append("though none reaches 90 % of a step within the time asked for")
-    slow = [entry.method for entry in other_designs if not entry.fast_enough] if best.fast_enough else []
-    if slow:
-        words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
+    slow = [entry for entry in other_designs if not entry.fast_enough] if best.fast_enough else []
+    late = [entry.method for entry in slow if any(fault.figures.most > limit for fault in entry.faults)]
+    leaving = [entry.method for entry in slow if entry.method not in late]
+    if late:
+        words.append(f"90 % of a step is not reached within {duration(limit)} by {', '.join(late)}")
+    if leaving:
+        words.append(f"the estimate of a step does not stay within 10 % of it by {', '.join(leaving)}")
     if by_default not in ("", best.method):
         words.append(f"`method: auto` would choose {by_default}, because it ranks without your scenario")
     return "; ".join(words)

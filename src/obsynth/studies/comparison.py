@@ -67,20 +67,24 @@ _HEADER = (
 )
 #: Where the bound stands among the numbers between order and time, and the shares of the least possible.
 _BOUND_COLUMN, _SHARE_COLUMNS = _HEADER.index("bound") - 3, slice(-2, None)
+#: Where times and sizes of alarms stand, of which there may be none.
+_NEVER_COLUMNS = tuple(_HEADER.index(name) - 3 for name in ("s to alarm", "smallest"))
+#: Where times of a step stand, which are followed for as long as the runs: no more is known of later ones.
+_TIME_COLUMNS = tuple(_HEADER.index(name) - 3 for name in ("s to 50 %", "s to 90 %"))
 #: A gain, or a bound as a share of the fault, of at most this is zero but for rounding, and is shown as zero.
 ROUNDED_GAIN = 1e-9
 
 #: What the columns of numbers mean.
 _FIGURE_MEANINGS = {
     "order": "states of the observer",
-    "s to 50 %": "time until the estimate of a unit step reaches 50 %",
-    "s to 90 %": "time until the estimate of a unit step reaches 90 %",
+    "s to 50 %": "time until the estimate of a unit step reaches 50 %; after >: not while it was followed",
+    "s to 90 %": "time until the estimate of a unit step reaches 90 %; after >: not while it was followed",
     "at horizon": "the estimate of a unit step at the end",
     "peak": "its largest absolute value",
     "deviation": "standard deviation of the estimate",
     "gain from d": "largest gain from an unknown input to the estimate",
     "bias": "largest mean of the estimate without a fault",
-    "s to alarm": "median detection delay",
+    "s to alarm": "median detection delay; never: not within the run",
     "smallest": "step that half of the runs detect",
     "bound": (
         "largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances: those "
@@ -180,6 +184,14 @@ class Comparison:
             for k, fault in enumerate(entry.faults):
                 order, *figures, milliseconds = self._figures(entry, fault)
                 texts = [_number(value) for value in figures]
+                for column in _NEVER_COLUMNS:
+                    if np.isinf(figures[column]):
+                        texts[column] = "never"
+                if self._has_delays and np.isinf(fault.equal_delay):
+                    texts[-3] = "never"
+                for column in _TIME_COLUMNS:
+                    if np.isinf(figures[column]):
+                        texts[column] = f"> {number(fault.figures.horizon, digits=3)}"
                 if np.isfinite(fault.bound):
                     is_rounding = fault.bound <= ROUNDED_GAIN * fault.size
                     texts[_BOUND_COLUMN] = "0" if is_rounding else upper_number(fault.bound)
@@ -419,4 +431,4 @@ def _figures(entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]
 
 
 def _number(value: float) -> str:
-    return "-" if np.isnan(value) else "never" if np.isinf(value) else number(value, digits=3)
+    return "-" if np.isnan(value) else "inf" if np.isinf(value) else number(value, digits=3)

@@ -18,6 +18,7 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.delayed_signals import counted_at_reading, whole_samples_late
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation, unchanged_states, with_states
@@ -178,6 +179,12 @@ def linear_plant(source: Any) -> DescriptorSystem:
         raise SpecError(
             "A linear plant with constant matrices is needed, and this one has scheduling parameters. Give the plant "
             "at one of their points, plant.at({...}), or compare designs by obsynth.simulate.",
+            path="plant",
+        )
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        raise SpecError(
+            "A linear plant with constant matrices is needed, and this one changes with k. obsynth check names the "
+            "methods that take it, and obsynth simulate and evaluate show what each of them does.",
             path="plant",
         )
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
