@@ -76,8 +76,8 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
             document = YAML(typ="safe", pure=True).load(text)
         count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:
-        problem = of_another_kind(path, _WANTED) or f"{path} is not valid YAML: {syntax_error(error, text)}"
-        raise SpecError(problem, path=place) from error
+        kind = of_another_kind(path, _WANTED)
+        raise SpecError(kind or f"{path} is not valid YAML: {syntax_error(error, text)}", path=place) from error
     except RecursionError as error:
         raise SpecError(f"{path} is not a valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
