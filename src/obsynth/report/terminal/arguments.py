@@ -199,7 +199,7 @@ def number_of(name: str, text: str) -> float:
                 f"{name}={text}: values are in the unit of their signal, which is not written. Give {name}={first}.",
                 path=name,
             ) from None
-        raise SpecError(f"{name}={text}: {text!r} is not a number.", path=name) from None
+        raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
 
 
 def _is_number(text: str) -> bool:
