@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 from benchmarks.campaigns import optimal_filters
 
 import obsynth
@@ -207,3 +208,27 @@ def _impulses(observer: obsynth.LinearObserver, count: int) -> np.ndarray:
         answers.append(observer.Cz[rows] @ state)
         state = observer.Az @ state
     return np.array(answers)
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_nothing_beats_no_filter_where_a_decoupled_disturbance_hides_the_fault(norm: str) -> None:
+    """Two areas of a network: the governor's fault and the load of its area act on one frequency alone.
+
+    The filter of least gain read rounding of the states, and was refused.
+    """
+    area = np.array([[-0.05, 6.0, 0.0], [0.0, -1 / 0.3, 1 / 0.3], [-1 / 0.192, 0.0, -12.5]])
+    a = scipy.linalg.block_diag(area, [[0.0]], area)
+    a[[0, 4], 3] = -6.0, 6.0
+    a[3, [0, 4]] = 0.5447, -0.5447
+    governor, load = 12.5 * np.eye(7)[:, 2:3], -6.0 * np.eye(7)[:, 0:1]
+    plant = obsynth.DescriptorSystem(
+        A=a, C=np.eye(7)[[0, 4, 3]], Bf=governor, Bd=load, dt=0.0,
+        Bw=np.hstack([-6.0 * np.eye(7)[:, 4:5], np.zeros((7, 3))]), Dw=np.hstack([np.zeros((3, 1)), 1e-3 * np.eye(3)]),
+    )  # fmt: skip
+    reference = {"bandwidth": 2.0, "order": 1 if norm == "hinf" else 2}
+    design = obsynth.optimal_filter(plant, norm=norm, exact=False, reference=reference, decoupled="d1")
+    assert design.report.passed
+    assert design.observer.order == 0
+    assert not np.any(design.observer.Dy)
+    assert design.gain == pytest.approx(1.0 if norm == "hinf" else 0.5**0.5, rel=1e-8)
+    assert design.least == pytest.approx(design.gain, rel=1e-8)

@@ -22,6 +22,7 @@ from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
+from obsynth.numerics.gramians import gramian
 from obsynth.numerics.least_estimation import (
     ADDED_NOISES,
     LeastEstimation,
@@ -44,6 +45,8 @@ from obsynth.verification.weighted_plant import weighted_plant
 ZERO_GAIN = 1e-9
 #: A filter whose deviation is by no more than this share below that of the estimate zero reads rounding.
 NO_LESS = 1e-12
+#: The search of a least gain ends within this share of it.
+SEARCHED_SHARE = 1e-7
 
 _SOURCE = "Varga 2017, section 5.2, and ours"
 
@@ -411,6 +414,22 @@ def _deviation_without_filter(fault_map: FaultMap) -> float:
     if d.any():
         return math.inf
     return float(np.sqrt(max(np.trace(c @ continuous_lyapunov(a, -b @ b.T) @ c.T), 0.0))) if len(a) else 0.0
+
+
+def without_filter(plant: DescriptorSystem, chosen: Designed, norm: str) -> Designed | None:
+    """Return the estimate zero, where no filter of model matching has a norm below its own; else ``None``."""
+    fault_map = chosen.fault_map
+    if fault_map.exact or (norm == "h2" and not plant.is_discrete):
+        return None
+    model = reduce(in_series, fault_map.setting.models)
+    if norm == "h2":
+        a, b, c, d = model
+        own = float(np.sqrt(np.sum(d**2) + np.trace(c @ gramian(a, b @ b.T) @ c.T)))
+    else:
+        own = _reference_gain(plant, fault_map, chosen.problem.alpha)
+    if chosen.least_gain < own * (1.0 - SEARCHED_SHARE):
+        return None
+    return chosen._replace(filter=_no_filter(len(model[3]), plant.ny), gain=own, added_noise=0.0)
 
 
 def _no_filter(rows: int, outputs: int) -> Model:
