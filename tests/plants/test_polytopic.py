@@ -58,6 +58,12 @@ def test_functions_of_parameters_are_enclosed_and_shared() -> None:
         (["2 * p * (1 / q)", "p / (3 * q)", "(1 / q) * p"], ("p / q",)),
         (["2 / (1 + p) + q", "-1 / (1 + p) / 3"], ("q", "1 / (1 + p)")),
         (["0 / (1 + q) + p", "q"], ("p", "q")),
+        (["(1 / q) ** 2 + p", "1 / q ** 2", "(2 / q) ** 2 / 3"], ("p", "1 / (q ** 2)")),
+        (["p * (1 / q) ** 2", "p / q ** 2", "p / q / q", "(p / q) * (1 / q)"], ("p / (q ** 2)",)),
+        (["(p / q) ** 3", "p ** 3 / q ** 3", "(p / q) * (p / q) ** 2"], ("(p ** 3) / (q ** 3)",)),
+        (["sqrt(q) + p", "q ** 0.5", "2 * q ** (1 / 2)"], ("p", "sqrt(q)")),
+        (["1 / sqrt(q) - p", "q ** (-0.5)", "p / sqrt(q) / p"], ("p", "1 / sqrt(q)", "p / (p * sqrt(q))")),
+        (["1 / (1 + 1 / q) + p"], ("p", "1 / (1 + (1 / q))")),
     ],
 )
 def test_multiples_of_one_function_are_one(texts: list[str], functions: tuple[str, ...]) -> None:
@@ -69,7 +75,7 @@ def test_multiples_of_one_function_are_one(texts: list[str], functions: tuple[st
     assert plant.scheduling.functions == functions
     assert plant.count == 2 ** len(functions)
     values = {"p": 1.25, "q": 0.75}
-    written = [eval(text, {"sin": np.sin, **values}) for text in texts]
+    written = [eval(text, {"sin": np.sin, "sqrt": np.sqrt, **values}) for text in texts]
     assert plant.at(values).Bd.ravel() == pytest.approx(written, abs=1e-14)
 
 
@@ -228,3 +234,17 @@ def test_a_point_that_is_not_a_number_is_refused_by_name() -> None:
     with pytest.raises(SpecError, match=f"{pendulum.scheduling.names[0]} is NaN") as refused:
         pendulum.scheduling.weights(point)
     assert refused.value.path == f"scheduling.{pendulum.scheduling.names[0]}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0.5 + 0.2 * sign(v)", r"A\[1,2\]: 'sign\(v\)': sign jumps .* Here v in \[-1, 1\]"),
+        ("0.2 / v", r"A\[1,2\]: '1 / v': a divisor .* can be zero .* Here v in \[-1, 1\]"),
+        ("acos(3 * v)", r"A\[1,2\]: 'acos\(3 \* v\)': the argument of acos lies between -3 and 3"),
+        ("floor(v / 8 + 0.5)", r"A\[1,2\]: 'floor\(.*\)' is 0 everywhere in the region: write that number"),
+    ],
+)
+def test_a_function_without_a_range_is_named_with_its_entry_and_parameters(text: str, words: str) -> None:
+    with pytest.raises(PreconditionError, match=words):
+        PolytopicSystem(plant={"A": [["0.1 * v", text], [0, 0]], "C": [[1, 0]]}, scheduling={"v": [-1, 1]})

@@ -24,7 +24,8 @@ from obsynth.numerics.convex_hulls import spanning_points
 from obsynth.numerics.expressions import NAMED_NUMBERS, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.other_names import plant_keywords_suggested
-from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of
+from obsynth.plants.scheduled_inputs import require_measured, with_inputs_scheduled
+from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of, range_of_function
 from obsynth.plants.uncertainty import expressions_in
 
 #: Matrices that may change over a region.
@@ -64,6 +65,9 @@ class PolytopicSystem:
 
     Notes
     -----
+    A known input of ``plant`` may schedule it: what B and D have of it is then a column of an input that is one in
+    every row (``shift``).
+
     Entries may be any functions of the parameters.  Each nonlinear function, such as ``v ** 2`` beside ``v``, becomes a
     dimension of the polytope, with proved bounds.  The polytope then contains more plants than the parameters allow,
     and a proof for the polytope holds for all of these.  Entries are rounded to double precision once.
@@ -103,6 +107,7 @@ class PolytopicSystem:
         if (vertices is None) == (plant is None):
             raise SpecError("Give vertices, or plant with expressions and scheduling.", path="vertices")
         arguments: dict[str, Any]
+        own_shift = shift
         if vertices is not None:
             if constants:
                 raise SpecError("constants are for plant, whose entries may be expressions.", path="constants")
@@ -110,11 +115,12 @@ class PolytopicSystem:
             arguments = {"vertices": [vertex.as_dict() for vertex in dense_vertices], "scheduling": _plain(scheduling)}
         else:
             numbers = _constants(constants)
-            dense_vertices, held = _from_expressions(plant or {}, scheduling, numbers)
+            dense_vertices, held, own_shift = _from_expressions(plant or {}, scheduling, numbers, shift)
             arguments = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
-        if shift is not None and shift not in dense_vertices[0].input_names:
+        if own_shift is not None and own_shift not in dense_vertices[0].input_names:
             raise SpecError(f"shift is {shown(shift)}, which is no input of the plant.", path="shift")
         arguments |= {} if shift is None else {"shift": shift}
+        shift = own_shift
         for name, value in (
             ("vertices", dense_vertices),
             ("scheduling", held),
@@ -287,6 +293,14 @@ def _from_vertices(
             "(leave scheduling out), or give plant with expressions.",
             path="scheduling",
         )
+    require_measured(parameters, {name: getattr(first, name) for name in _SHARED if name.endswith("_names")})
+    ((name, entry),) = parameters.items()
+    if (entry.get("column") or name) in first.input_names:
+        raise SpecError(
+            f"{name!r} is a known input: two vertices do not tell what it does by itself. Give plant with expressions, "
+            "which may have it in A and as an input.",
+            path=f"scheduling.{name}",
+        )
     return dense, _scheduling(parameters, tuple(parameters))
 
 
@@ -311,9 +325,12 @@ def _constants(values: Mapping[str, float] | None) -> dict[str, float]:
 
 
 def _from_expressions(
-    plant_arguments: Mapping[str, Any], scheduling: Mapping[str, Any] | None, constants: Mapping[str, float]
-) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
-    """Return the vertices of a plant whose entries are expressions, and its scheduling."""
+    plant_arguments: Mapping[str, Any],
+    scheduling: Mapping[str, Any] | None,
+    constants: Mapping[str, float],
+    shift: str | None,
+) -> tuple[tuple[DescriptorSystem, ...], Scheduling, str | None]:
+    """Return the vertices of a plant whose entries are expressions, its scheduling, and the input that is one."""
     if not isinstance(plant_arguments, Mapping):
         raise SpecError(
             f"plant is {a_kind(plant_arguments)}: give the arguments of DescriptorSystem by name.", path="plant"
@@ -333,6 +350,7 @@ def _from_expressions(
     written: dict[str, list[tuple[int, int, str]]] = {}
     for name in SCHEDULED_MATRICES:
         arguments[name], written[name] = expressions_in(arguments.get(name))
+    arguments, written, shift = with_inputs_scheduled(arguments, written, parameters, shift)
     # Each function doubles the number of vertices.  Products of sums are expanded if that makes fewer functions and
     # keeps all parameters.
     choices = [_forms(written, constants, tuple(parameters), expanded=expanded) for expanded in (False, True)]
@@ -347,9 +365,32 @@ def _from_expressions(
             f"No entry depends on {idle[0]!r}: leave it out of scheduling, or write it into an entry of the matrices.",
             path=f"scheduling.{idle[0]}",
         )
-    held = _scheduling(parameters, [text for text in functions if text in used])
     base = _descriptor({key: value for key, value in arguments.items() if value is not None})
-    return tuple(_vertex(base, forms, dict(zip(held.functions, row, strict=True))) for row in held.corners), held
+    require_measured(parameters, {name: getattr(base, name) for name in _SHARED if name.endswith("_names")})
+    try:
+        held = _scheduling(parameters, [text for text in functions if text in used])
+    except PreconditionError:
+        _require_bounded(forms, {name: (entry["range"][0], entry["range"][1]) for name, entry in parameters.items()})
+        raise
+    corners = tuple(_vertex(base, forms, dict(zip(held.functions, row, strict=True))) for row in held.corners)
+    return corners, held, shift
+
+
+def _require_bounded(
+    forms: Mapping[str, list[tuple[int, int, LinearForm]]], box: Mapping[str, tuple[float, float]]
+) -> None:
+    """Raise `PreconditionError` for a function without a range over the region, with the entry it is in."""
+    for matrix, entries in forms.items():
+        for row, column, form in entries:
+            for text in form.parts:
+                try:
+                    range_of_function(parse_expression(text), box)
+                except PreconditionError as error:
+                    names = sorted(parse_expression(text).names)
+                    ranges = ", ".join(f"{name} in [{box[name][0]:.6g}, {box[name][1]:.6g}]" for name in names)
+                    raise PreconditionError(
+                        f"{matrix}[{row + 1},{column + 1}]: {error} Here {ranges}.", condition=error.condition
+                    ) from None
 
 
 def _forms(

@@ -102,7 +102,9 @@ class Scheduling:
         if len(self.functions) > MOST_FUNCTIONS:
             raise SpecError(
                 f"The matrices depend on {len(self.functions)} functions of the scheduling parameters, which makes "
-                f"2 ** {len(self.functions)} vertices: at most {MOST_FUNCTIONS} functions are taken.",
+                f"2 ** {len(self.functions)} vertices: at most {MOST_FUNCTIONS} functions are taken. Write numbers "
+                "for those that change least (constants, for a parameter), or one formula where several are nearly the "
+                "same.",
                 path="scheduling",
             )
         freeze(self, "columns", "units", low=low, high=high)
@@ -139,17 +141,7 @@ class Scheduling:
     def bounds(self) -> FloatArray:
         """``(q, 2)``: ends of the range of every function over the region, enclosed with outward rounding."""
         box = {name: (float(a), float(b)) for name, a, b in zip(self.names, self.low, self.high, strict=True)}
-        ranges = []
-        for expression in self.expressions:
-            if expression.text in box:
-                ranges.append(box[expression.text])
-                continue
-            known = range_over(expression, box)
-            if not known.low < known.high:
-                raise PreconditionError(
-                    f"{expression.text!r} is the same everywhere in the region: write its value.", condition="range"
-                )
-            ranges.append((known.low, known.high))
+        ranges = [range_of_function(expression, box) for expression in self.expressions]
         return read_only(np.array(ranges, dtype=np.float64).reshape(len(ranges), 2))
 
     @cached_property
@@ -308,6 +300,24 @@ def _require_rate(name: str, rate: Any) -> None:
         )
 
 
+def range_of_function(expression: Expression, box: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Return the ends of the range of a function over a box of its parameters.
+
+    Raises
+    ------
+    PreconditionError
+        It is not bounded, jumps, or is the same everywhere.
+    """
+    if expression.text in box:
+        return box[expression.text]
+    known = range_over(expression, box)
+    if not known.low < known.high:
+        raise PreconditionError(
+            f"{expression.text!r} is {known.low:.6g} everywhere in the region: write that number.", condition="range"
+        )
+    return known.low, known.high
+
+
 def parameters_of(scheduling: Any) -> dict[str, dict[str, Any]]:
     """Return scheduling parameters as ``{name: {range, rate, column, unit}}``; raise `SpecError` for anything else."""
     if not isinstance(scheduling, Mapping) or not scheduling:
@@ -429,11 +439,11 @@ def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Calla
         if operation is np.multiply:
             return _product(forms[0], forms[1], expanded=expanded)
         monomials = [form.monomial for form in forms]
+        if operation is np.power and forms[1].constant == Fraction(1, 2) and not forms[1].parts:
+            return LinearForm(Fraction(0), {f"sqrt({forms[0].text})": Fraction(1)})
         if operation is np.power and monomials[0] and not forms[1].parts and forms[1].constant in SMALL_POWERS:
-            factor, text_of_base = monomials[0]
-            times = int(forms[1].constant)
-            return LinearForm(Fraction(0), {_text_of_factors(_factors(text_of_base) * times): factor**times})
-        if operation is np.power and not forms[1].parts and -forms[1].constant in (1, *SMALL_POWERS):
+            return _power(*monomials[0], int(forms[1].constant))
+        if operation is np.power and not forms[1].parts and -forms[1].constant in (Fraction(1, 2), 1, *SMALL_POWERS):
             below = done(forms[0], LinearForm(-forms[1].constant)) if forms[1].constant != -1 else forms[0]
             return _quotient(LinearForm(Fraction(1)), below)
         if operation is np.divide and (any(monomials) or not forms[0].parts) and forms[1].parts:
@@ -453,23 +463,29 @@ def _linear_operation(operation: Callable[..., Any], *, expanded: bool) -> Calla
 
 
 def _quotient(above: LinearForm, below: LinearForm) -> LinearForm:
-    """Return a quotient whose divisor moves: numbers are taken out of both, and a quotient of one is its inverse's."""
-    number, x = above.monomial or (Fraction(1), above.text)
-    if not above.parts:
-        number, x = above.constant, "1"
-    divisor, y = below.monomial or (Fraction(1), below.text)
-    if (inverse := _inverse_of(x)) is not None:
-        x, y = "1", _text_of_factors([*_factors(inverse), *_factors(y)])
-    return LinearForm(Fraction(0), {TEXTS_OF_OPERATIONS[np.divide](x, y): number / divisor} if number else {})
+    """Return a quotient whose divisor moves: numbers are taken out of both, and all that divides is one product."""
+    number, (factors, divisors) = _factor_and_fraction(above)
+    divisor, (more, under) = _factor_and_fraction(below)
+    if under:  # nothing is cancelled: as written there is no value where what divides the divisor is zero
+        more = [_text_of_fraction(more, under)]
+    text = _text_of_fraction(factors, [*divisors, *more])
+    return LinearForm(Fraction(0), {text: number / divisor} if number else {})
 
 
-def _inverse_of(text: str) -> str | None:
-    """Return what one is divided by; `None` of anything else."""
-    below = text.removeprefix("1 / ")
-    if below == text or _FACTOR.fullmatch(below):
-        return None if below == text else below
-    depths = list(itertools.accumulate((letter == "(") - (letter == ")") for letter in below))
-    return below[1:-1] if below.startswith("(") and depths.index(0) == len(below) - 1 else None
+def _factor_and_fraction(form: LinearForm) -> tuple[Fraction, tuple[list[str], list[str]]]:
+    """Return a number and what is multiplied and divided; a sum is one factor."""
+    if not form.parts:
+        return form.constant, ([], [])
+    if form.monomial is None:
+        return Fraction(1), ([form.text], [])
+    factor, text = form.monomial
+    return factor, _fraction(text)
+
+
+def _power(factor: Fraction, text: str, times: int) -> LinearForm:
+    """Return a small power of a multiple of one function."""
+    factors, divisors = _fraction(text)
+    return LinearForm(Fraction(0), {_text_of_fraction(factors * times, divisors * times): factor**times})
 
 
 def _product(one: LinearForm, other: LinearForm, *, expanded: bool) -> LinearForm:
@@ -478,44 +494,64 @@ def _product(one: LinearForm, other: LinearForm, *, expanded: bool) -> LinearFor
         total = one.times(other.constant).plus(other.times(one.constant), 1)
         total = LinearForm(one.constant * other.constant, total.parts)
         for (x, a), (y, b) in itertools.product(one.parts.items(), other.parts.items()):
-            total = total.plus(LinearForm(Fraction(0), {_text_of_factors([*_factors(x), *_factors(y)]): a * b}), 1)
+            total = total.plus(LinearForm(Fraction(0), {_text_of_product(_fraction(x), _fraction(y)): a * b}), 1)
         return total
-    factor, factors, divisors = Fraction(1), list[str](), list[str]()
-    for form in (one, other):
-        own, text = form.monomial or (Fraction(1), "")
-        factor *= own
-        if (inverse := _inverse_of(text)) is not None:
-            divisors += _factors(inverse)
-        else:
-            factors += _factors(text) if text else [form.text]
-    product = _text_of_factors(factors) or "1"
-    if divisors:
-        product = TEXTS_OF_OPERATIONS[np.divide](product, _text_of_factors(divisors))
-    return LinearForm(Fraction(0), {product: factor})
+    (factor, fraction), (factor_of_other, fraction_of_other) = map(_factor_and_fraction, (one, other))
+    return LinearForm(Fraction(0), {_text_of_product(fraction, fraction_of_other): factor * factor_of_other})
+
+
+def _text_of_product(one: tuple[list[str], list[str]], other: tuple[list[str], list[str]]) -> str:
+    return _text_of_fraction([*one[0], *other[0]], [*one[1], *other[1]])
+
+
+def _fraction(text: str) -> tuple[list[str], list[str]]:
+    """Return the factors of a function and those of what it is divided by."""
+    parts = _split(text, " / ")
+    if len(parts) != 2 or any(len(_split(text, sign)) > 1 for sign in (" + ", " - ")):
+        return _factors(text), []
+    above, below = map(_without_brackets, parts)
+    return ([] if above == "1" else _factors(above)), _factors(below)
 
 
 def _factors(text: str) -> list[str]:
     """Return the factors of a function, as often as each is one: itself alone where it is no product."""
+    if any(len(_split(text, sign)) > 1 for sign in (" + ", " - ", " / ")):
+        return [text]
+    factors = list[str]()
+    for part in _split(text, " * "):
+        base, _, power = part.rpartition(" ** ")
+        times = int(power) if base and power.isdigit() and int(power) in SMALL_POWERS else 0
+        factors += [_without_brackets(base)] * times if times else [_without_brackets(part)]
+    return factors
+
+
+def _split(text: str, sign: str) -> list[str]:
+    """Return the parts of a text between signs that stand in no brackets."""
     parts, depth, begun = list[str](), 0, 0
     for i, character in enumerate(text):
         depth += (character == "(") - (character == ")")
-        if depth == 0 and text[i : i + 3] in (" + ", " - ", " / "):
-            return [text]
-        if depth == 0 and text[i : i + 3] == " * ":
+        if depth == 0 and text.startswith(sign, i):
             parts.append(text[begun:i])
-            begun = i + 3
-    factors = list[str]()
-    for part in [*parts, text[begun:]]:
-        base, _, power = part.rpartition(" ** ")
-        times = int(power) if base and power.isdigit() and int(power) in SMALL_POWERS else 0
-        factors += [base] * times if times else [part]
-    return factors
+            begun = i + len(sign)
+    return [*parts, text[begun:]]
+
+
+def _without_brackets(text: str) -> str:
+    """Return a text without the brackets that hold all of it."""
+    depths = list(itertools.accumulate((letter == "(") - (letter == ")") for letter in text))
+    held = text.startswith("(") and depths.index(0) == len(text) - 1
+    return _without_brackets(text[1:-1]) if held else text
+
+
+def _text_of_fraction(factors: list[str], divisors: list[str]) -> str:
+    """Return a product, or a quotient of two, in one order of what is multiplied."""
+    above = _text_of_factors(factors) if factors else "1"
+    return TEXTS_OF_OPERATIONS[np.divide](above, _text_of_factors(divisors)) if divisors else above
 
 
 def _text_of_factors(factors: list[str]) -> str:
     """Return a product in one order of its factors, each of which is written once."""
-    # A factor that is a product of its own, or a sum, has its brackets already or gets them here.
-    counts = Counter(_bracketed(factor) for factor in factors)
+    counts = Counter(map(_bracketed, factors)) if len(factors) > 1 else {factors[0]: 1}
     return " * ".join(text if count == 1 else f"{text} ** {count}" for text, count in sorted(counts.items()))
 
 

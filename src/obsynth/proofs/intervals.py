@@ -335,6 +335,8 @@ def _cosh(x: Interval) -> Interval:
 
 
 def _acos(x: Interval) -> Interval:
+    if not -1.0 <= x.low <= x.high <= 1.0:
+        raise _unbounded(f"the argument of acos lies between {x.low:.4g} and {x.high:.4g}")
     return -_increasing(math.asin)(x) + Interval.outward(math.pi / 2.0, math.pi / 2.0)
 
 

@@ -13,12 +13,10 @@ from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.scheduled_inputs import SHIFT_INPUT
 from obsynth.plants.scheduling import parameters_of
 from obsynth.plants.transformations.entries_in_constants import entries_in, promoted, require_linear_beside
 from obsynth.plants.transformations.equilibrium import Point
-
-#: Input of a linear model whose equilibrium depends on constants or on its scheduling: it is one, always.
-SHIFT_INPUT = "shift"
 
 
 def scheduled_names(
