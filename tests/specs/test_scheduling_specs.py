@@ -130,4 +130,4 @@ def test_commands_for_other_plants_say_why_they_refuse(tmp_path: Path, capsys: p
     spec = str(_written(tmp_path))
     for command in (["compare"], ["sensors"]):
         assert main([*command, "--system", spec]) == 2
-        assert "give that at one point, plant.at({...})" in " ".join(capsys.readouterr().err.split())
+        assert "Give the plant at one of their points, plant.at({...})" in " ".join(capsys.readouterr().err.split())
