@@ -1,12 +1,13 @@
 """Estimation in square roots: a step of the descriptor Kalman filter, smoothing, recursive least squares.
 
-A step is generalised least squares after Paige: from ``Y = H x + S e``, ``e ~ N(0, I)``, the estimate of x, a square
-root of its covariance and the whitened parity innovation, all from two orthogonal factorisations; no covariance is ever
-formed or inverted. Recursive least squares with forgetting takes whitened data.
+A step is generalised least squares after Paige.  From ``Y = H x + S e`` with ``e ~ N(0, I)``, two orthogonal
+factorisations give the estimate of x, a square root of its covariance, and the whitened parity innovation.  No
+covariance is formed or inverted.  Recursive least squares with forgetting uses the whitened data.
 
-With ``x = m + F c + D d``, ``c ~ N(0, I)`` and d unknown, the factorisations of a step give the way back ``[c; d]_k =
-j_0 + J_1 [c; d]_k+1 + J_2 b + J_3 w``, ``b ~ N(0, I)`` and w unknown, independent of everything later: the smoother of
-Rauch, Tung and Striebel without an inverse, so that covariances may be singular.
+Smoothing writes the state as ``x = m + F c + D d`` with ``c ~ N(0, I)`` and unknown d.  The factorisations of a step
+give the backward relation ``[c; d]_k = j_0 + J_1 [c; d]_k+1 + J_2 b + J_3 w``, where ``b ~ N(0, I)`` and the unknown w
+are independent of all later samples.  That is the smoother of Rauch, Tung and Striebel without an inverse, so that
+covariances may be singular.
 """
 
 from __future__ import annotations
@@ -23,55 +24,54 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 
-#: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
+#: Larger standard deviations are left to the caller: their squares overflow at 1e154.
 OUTGROWN = 1e100
 
-#: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
-#: what a condition number of 1e12 does, far above rounding.
+#: The rank-revealing step decides if a column of H keeps less than this share of its length after projection onto the
+#: complement of the others.  That is far below the effect of a condition number of 1e12, and far above rounding.
 DEPENDENT_COLUMN = 1e-14
 
-#: The same where samples are missing, so that a rank is likely to be lost: more than rounding leaves of a column.
+#: The same limit where samples are missing and a loss of rank is likely: more than rounding leaves of a column.
 SUSPECT_COLUMN = RANK_TOLERANCE
 
-#: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
-#: must lie above `PERFECT_PARITY`, or rounding passes for noise.
+#: The rank-revealing step also decides if a row of the parity's noise is below this share of the whole noise.  It
+#: exceeds `PERFECT_PARITY`, or rounding would count as noise.
 SUSPECT_PARITY = 1e-12
 
-#: The same below which sources of noise are factorised the largest first: as many digits are lost otherwise.
+#: Below this share noise sources are factorised by decreasing size, since other orders lose as many digits.
 FAR_PARITY = 1e-8
 
-#: Rows of H that differ by no more than this in size cost a factorisation no digits.
+#: Ratio of the largest to the smallest row of H up to which a factorisation needs no scaling of rows.
 FAR_ROWS = 256.0
 
-#: Parity that is at most this fraction of the rows is factorised beforehand, for a sixteenth of the work of all rows.
+#: If the rows are at least this many times the parity, the parity is factorised first, for a sixteenth of the work.
 FEW_PARITY = 4
 
-#: Columns that LAPACK's ``tpqrt`` treats at once.
+#: Block size of LAPACK's ``tpqrt``.
 TPQRT_BLOCK = 32
 
-#: Room for each column that LAPACK's factorisations are given: more than any of their blocks takes.
+#: Workspace per column for LAPACK's factorisations: more than any of their blocks needs.
 WORK = 64
 
-#: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
+#: Noise-free parity has to vanish to this share of its terms: the rounding of data in double precision.
 CONSISTENCY = 1e-9
 
-
-#: Combinations of data without noise in which outputs have less than this share are of equations alone.
+#: A noise-free combination of data consists of equations only if no output has more than this share in it.
 SENSOR_SHARE = RANK_TOLERANCE
 
-#: A direction is discounted only where new data bring at least this share of what forgetting takes away.
+#: A direction is forgotten only if new data bring at least this share of the information that forgetting removes.
 WORTH_FORGETTING = 0.1
-
 
 #: A factorisation with pivoting, see `_largest_first`.
 _Factored = tuple[FloatArray, NDArray[np.intp], FloatArray, NDArray[np.intp]]
 
 
 class LeastSquaresStep(NamedTuple):
-    """``estimate (n, columns)``, ``P = factor factor'``, the whitened parity ``innovation (m, columns)``, and
+    """The result of a step.
 
-    ``diffuse (n, r)``: directions of x about which nothing is known, none unless samples are missing; ``rounding (n,
-    any)``: a root of what rounding makes of x, without columns unless outputs without noise are redundant.
+    ``estimate (n, columns)`` has the covariance ``factor factor'``; ``innovation (m, columns)`` is the whitened parity.
+    ``diffuse (n, r)`` are unknown directions of x, none unless samples are missing.  ``rounding (n, any)`` is a root of
+    the covariance of rounding errors in x, without columns unless noise-free outputs are redundant.
     """
 
     estimate: FloatArray
@@ -82,14 +82,14 @@ class LeastSquaresStep(NamedTuple):
 
 
 class Rounding(NamedTuple):
-    """What no stated noise explains in the data of a step: ``root (rows, any)``, in units that are free."""
+    """Rounding errors in the data of a step: ``root (rows, any)`` of their covariance, in arbitrary units."""
 
     root: FloatArray
     measured: NDArray[np.bool_]  # ``(rows,)``: which rows are outputs
-    is_followed: bool  # whether it was needed before
+    is_followed: bool  # whether an earlier step needed it
 
     def of(self, received: NDArray[np.bool_]) -> Rounding:
-        """Return the same of some rows ``(rows,)``."""
+        """Return the rounding errors of the received rows ``(rows,)``."""
         return self._replace(root=self.root[received], measured=self.measured[received])
 
 
@@ -102,9 +102,10 @@ class Projection(NamedTuple):
 
 
 def row_sizes(H: FloatArray) -> FloatArray | None:
-    """Return the sizes of the rows of ``H (rows, n)``, powers of two, where they are far from each other; or ``None``.
+    """Return the sizes of the rows of ``H (rows, n)`` as powers of two, or ``None`` where they are similar.
 
-    A factorisation adds rows: where one is in thousands and another in millionths, the latter lose their digits."""
+    A factorisation adds multiples of rows, so that small rows lose their digits to large ones without scaling.
+    """
     lengths = np.sqrt(np.einsum("ij,ij->j", H, H))
     sizes = power_of_two_below(np.max(np.abs(H) / np.where(lengths > 0.0, lengths, 1.0), axis=1, initial=0.0))
     return None if not sizes.size or np.max(sizes) <= FAR_ROWS * np.min(sizes) else sizes
@@ -113,8 +114,10 @@ def row_sizes(H: FloatArray) -> FloatArray | None:
 def projection_of(
     H: FloatArray, *, least: float = DEPENDENT_COLUMN, sizes: FloatArray | None = None
 ) -> Projection | None:
-    """Return the factorisation of ``H (rows, n)``, of its rows over ``sizes (rows,)`` where these are given, as data
-    and noise are by the rotation; or ``None`` where its rank has to be decided."""
+    """Return the QR factorisation of ``H (rows, n)``, or ``None`` where its rank has to be decided.
+
+    With ``sizes (rows,)`` the rows are divided by these; the rotation divides data and noise as well.
+    """
     rows, n = H.shape
     if rows < n:
         return None
@@ -139,10 +142,11 @@ def noise_triangle(noise: FloatArray) -> FloatArray:
 
 
 def _added(known: FloatArray, noise: FloatArray, parity: int, far: float) -> FloatArray:
-    """Return the triangular factor ``(rows, rows)`` of a triangle with more rows ``noise (any, rows)``.
+    """Return the triangular factor ``(rows, rows)`` of a triangle with further rows ``noise (any, rows)``.
 
-    The columns of the parity come first.  Where these are few they are factorised alone, and returned, if the diagonal
-    falls below ``far``: the rest would not be used."""
+    The columns of the parity come first.  If they are few, they are factorised alone, and returned alone if a diagonal
+    entry is below ``far``, since the caller then discards the result.
+    """
     for count in (parity, len(known)) if 0 < FEW_PARITY * parity <= len(known) else (len(known),):
         rows = np.asfortranarray(noise[:, :count])
         triangle = np.asarray(lapack.dtpqrt(0, min(TPQRT_BLOCK, count), known[:count, :count], rows)[0])
@@ -152,17 +156,17 @@ def _added(known: FloatArray, noise: FloatArray, parity: int, far: float) -> Flo
 
 
 def _least_diagonal(triangle: FloatArray, count: int) -> float:
-    """Return the smallest size of the first entries of the diagonal."""
+    """Return the smallest modulus of the first ``count`` diagonal entries."""
     return min(map(abs, triangle.diagonal()[:count].tolist()), default=math.inf)
 
 
 def projected_step(
     projection: Projection, noise: FloatArray, data: FloatArray, *, known: FloatArray | None = None
 ) -> LeastSquaresStep | None:
-    """Solve one step from rotated noise ``(s, rows)`` and data; ``None`` where the rank of the noise is to be decided.
+    """Solve one step from rotated noise ``(s, rows)`` and data.
 
-    ``known (rows, rows)``: triangular factor of more noise. Noise that outgrows double precision is left to the caller
-    too.
+    ``known (rows, rows)`` is a triangular factor of further noise.  ``None`` where the rank of the noise has to be
+    decided, or the noise outgrows double precision.
     """
     n = len(projection.head)
     rows, columns = data.shape
@@ -184,7 +188,7 @@ def projected_step(
             return None
         innovation = lapack.dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
         right[:, :columns] = data[m:] - triangle[:m, m:rows].T.dot(innovation)
-        # A reflection goes by the sign of what may be rounding of zero: that of a positive diagonal is the one taken.
+        # The sign of a reflection may depend on a rounded zero: make it unique by a positive diagonal.
         innovation = innovation * np.sign(diagonal)[:, None]
     else:
         right[:, :columns] = data
@@ -194,19 +198,19 @@ def projected_step(
 
 
 def directions_of(noise: FloatArray) -> int:
-    """Return how many columns of a square root ``(rows, any)`` are not zero: its noise has no more directions.
+    """Return the number of nonzero columns of a square root ``(rows, any)``, an upper bound of its noise directions.
 
-    Each parity that is whitened takes one of them.  Where they are fewer than the rows of a step, fewer than all states
-    keep a variance after it; a triangle of the size of all rows would fill the others with its rounding, which the next
-    step would take for noise."""
+    Each whitened parity uses up one direction.  With fewer directions than rows some states have no variance after the
+    step.  A triangle of the size of all rows would give them one by rounding, which the next step would take for noise.
+    """
     return int(np.count_nonzero(noise.any(axis=0)))
 
 
 def least_squares_step(
     H: FloatArray, S: FloatArray, Y: FloatArray, *, least: float = DEPENDENT_COLUMN
 ) -> LeastSquaresStep | None:
-    """Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided: of H, of the parity, or of
-    noise in fewer directions than there are rows.
+    """Solve one step by LAPACK, or return ``None`` where a rank has to be decided: that of H, of the parity, or of
+    noise with fewer directions than rows.
 
     With ``H = [Q_1 Q_2] [R_H; 0]`` and ``[Q_2'; Q_1'] S = [L 0; X T] Z'``: ``v = L^-1 Q_2' Y``, ``x = R_H^-1 (Q_1' Y -
     X v)`` and ``P = R_H^-1 T T' R_H^-T``.
@@ -227,24 +231,25 @@ def rank_revealing_step(
     rounding: Rounding | None = None,
     terms: FloatArray | None = None,
 ) -> LeastSquaresStep:
-    """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``.
+    """Solve one step with decisions on all ranks: x may be undetermined, and directions ``unknown (rows, r)``.
 
-    The factor has no more columns that are not zero than noise has independent directions beside those of the parity:
-    where none is left, x is known exactly, and its covariance is zero without rounding.
+    The factor has at most as many nonzero columns as the noise has independent directions besides the parity.  Without
+    any, x is known exactly, and its covariance is exactly zero.
 
-    Then combinations of the data vanish, and any multiple of them may be added to x: stated noise does not choose.
-    With ``rounding`` that multiple is taken by which the least of it remains; without, none, and errors that rounding
-    made go on as the plant lets them.
+    In that case some combinations of the data vanish, and multiples of them may be added to x without any effect on the
+    stated noise.  With ``rounding`` the multiple with the least rounding error is added; without it, none is, and
+    rounding errors propagate with the plant's dynamics.
 
-    ``terms`` of the same shape as Y say how large the terms are that Y is a sum of, by default Y itself: what vanishes
-    is judged beside them."""
+    ``terms``, of the shape of Y, are the sizes of the terms that Y is a sum of, by default Y itself.  A combination has
+    to vanish relative to its terms.
+    """
     n, S = H.shape[1], S[:, S.any(axis=0)]
     columns, sizes = Y.shape[1], np.abs(Y) if terms is None else terms
     if rounding is not None:
         Y = np.hstack([Y, rounding.root, np.eye(len(H))])
     says = H.any(axis=1) | S.any(axis=1) | unknown.any(axis=1)
     if not says.all():
-        # Of an equation 0 = 0 rounding would make one of the others, with noise of that size.
+        # Remove equations 0 = 0: their rounding errors would count as equations with tiny noise.
         _require_vanishing(Y[~says, mapped:columns], sizes[~says, mapped:], mapped)
         H, S, Y, sizes, unknown = (part[says] for part in (H, S, Y, sizes, unknown))
     S = _independent_noise(S)
@@ -259,20 +264,19 @@ def rank_revealing_step(
     factor, diffuse = _square(back[:n, Y.shape[1] :]), _basis(null, lengths[:n])
     estimate, innovation = back[:n, : Y.shape[1]], innovation[:, :columns]
     if rounding is None or directions_of(factor) == n:
-        # Where every state has a variance of its own, rounding is nothing beside it.
+        # Rounding errors are negligible where every state has a variance.
         return LeastSquaresStep(estimate[:, :columns], factor, innovation, diffuse, np.zeros((n, 0)))
     chosen, remaining = _least_rounding(estimate, vanishing, columns, rounding)
     return LeastSquaresStep(chosen, factor, innovation, diffuse, remaining)
 
 
 def _independent_noise(S: FloatArray) -> FloatArray:
-    """Return a root of the covariance of ``S (rows, any)`` whose columns are not more than it has independent
-    directions, unless these are as many as the rows.
+    """Return a root of the covariance of ``S (rows, any)`` with independent columns, unless it has full row rank.
 
-    Columns that depend on the others would leave as many of rounding in what comes after, and a later step, in which
-    nothing else is left, would take these for noise. Where every row has noise of its own, nothing passes for noise,
-    and to replace the columns would only round what large ones have in common: a few of 1e9 beside those of sensors
-    of 1e-4."""
+    Dependent columns would leave columns of rounding errors after the step, and a later step without other noise would
+    take these for noise.  With full row rank this cannot happen, and new columns would only round common parts of large
+    ones, such as columns of 1e9 besides sensor noise of 1e-4.
+    """
     if not S.size:
         return S
     sizes = np.linalg.norm(S, axis=1, keepdims=True)
@@ -281,13 +285,13 @@ def _independent_noise(S: FloatArray) -> FloatArray:
     rank = int(np.sum(np.abs(np.diagonal(packed)) > PERFECT_PARITY))
     if rank in S.shape:
         return S
-    # Which rows are independent does not depend on their units; digits of small columns do.
+    # Independent rows are chosen in scaled units, but the columns are factorised in given ones, to keep small digits.
     packed, _, tau, first = _largest_first(S[order[:rank]].T)
     return np.ascontiguousarray(_rotated(packed, tau, S.T[first])[:rank].T)
 
 
 def _square(root: FloatArray) -> FloatArray:
-    """Return a root ``(n, n)`` of the same covariance as ``root (n, any)``, with no more columns that are not zero."""
+    """Return a root ``(n, n)`` of the same covariance as ``root (n, any)``, with at most as many nonzero columns."""
     n = len(root)
     square = np.zeros((n, n))
     compact = _triangle(root.T)[:n].T if root.size else root
@@ -298,8 +302,11 @@ def _square(root: FloatArray) -> FloatArray:
 def _least_rounding(
     estimate: FloatArray, vanishing: FloatArray, columns: int, rounding: Rounding
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the estimate ``(n, columns)`` with the multiple of what vanishes that leaves the least rounding, and a
-    root of what is left; further columns of both are those of the rounding, and of the data one by one."""
+    """Return the estimate ``(n, columns)`` with the least rounding error, and a root of the covariance of that error.
+
+    Multiples of the vanishing combinations are added to the estimate.  Further columns of both arguments belong to the
+    rounding errors, and to the data one by one.
+    """
     end = columns + rounding.root.shape[1]
     entries = np.abs(vanishing[:, end:])
     if np.any(entries[:, rounding.measured] > SENSOR_SHARE * np.max(entries, axis=1, initial=0.0, keepdims=True)):
@@ -406,7 +413,7 @@ def _finite(matrix: FloatArray) -> FloatArray:
 
 
 def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what the null space leaves open in x, not counting rounding."""
+    """Return an orthonormal basis of the directions of x in the null space, without those of rounding size."""
     n = len(lengths)
     if not null.shape[1]:
         return np.zeros((n, 0))
@@ -417,8 +424,10 @@ def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
 def _whitened(
     q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, terms: FloatArray, mapped: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the whitened parity of Y, what it tells about the rest, the noise that is left in the rest, and what is
-    free of noise: of the columns from ``mapped`` on, which are data made of such ``terms``, it must vanish."""
+    """Return the whitened parity of Y, its share in the rest, the remaining noise of the rest, and noise-free parity.
+
+    The noise-free parity has to vanish relative to ``terms`` in the columns from ``mapped`` on, which are data.
+    """
     data = q2.T @ Y
     if not q2.shape[1]:
         return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S, data
@@ -427,7 +436,7 @@ def _whitened(
     scaled = (data / sizes)[order]
     lower = t[:rank, :rank].T
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
-    # What is left is free of noise: it must vanish, or the constraints contradict each other.
+    # The rest of the parity is free of noise: it has to vanish, or the constraints contradict each other.
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     made_of = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
     _require_vanishing(remainder[:, mapped : mapped + terms.shape[1]], made_of, mapped)
@@ -437,8 +446,10 @@ def _whitened(
 
 
 def _require_vanishing(remainder: FloatArray, terms: FloatArray, mapped: int) -> None:
-    """Raise `PreconditionError` where data without noise do not vanish beside their terms; none of them belongs to the
-    mean where earlier columns are mapped."""
+    """Raise `PreconditionError` where noise-free data do not vanish relative to their terms.
+
+    With ``mapped`` earlier columns none of the data belong to the mean.
+    """
     if mapped:
         no_mean = np.zeros((len(remainder), 1))
         remainder, terms = np.hstack([no_mean, remainder]), np.hstack([no_mean, terms])
@@ -462,9 +473,9 @@ def _require_consistent(remainder: FloatArray, terms: FloatArray) -> None:
 
 
 class SquareRootGaussian(NamedTuple):
-    """Coordinates as far as they are known: ``mean (c, columns) + factor (c, any) e + diffuse (c, any) w``, w unknown.
+    """Partly known coordinates: ``mean (c, columns) + factor (c, any) e + diffuse (c, any) w`` with unknown w.
 
-    The first column is the mean, the others its derivatives by parameters.
+    The first column of ``mean`` is the mean, the others are its derivatives by parameters.
     """
 
     mean: FloatArray
@@ -473,7 +484,7 @@ class SquareRootGaussian(NamedTuple):
 
 
 class SmootherGain(NamedTuple):
-    """The way back: j_0 ``offset (c, columns)``, J_1 ``from_next (c, c_next)``, J_2 and J_3 ``(c, any)``."""
+    """The backward relation: j_0 ``offset (c, columns)``, J_1 ``from_next (c, c_next)``, J_2 and J_3 ``(c, any)``."""
 
     offset: FloatArray
     from_next: FloatArray
@@ -490,10 +501,10 @@ def joint_step(
     *,
     complete: bool = True,
 ) -> tuple[SquareRootGaussian, SmootherGain]:
-    """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before;
-    return x, and the way back.
+    """Return x from ``H x = right + [known noise] e + unknown d``, and the backward relation.
 
-    Where the step is not complete, as samples are missing, the rank of H may be short.
+    ``known`` and ``unknown`` multiply the coordinates before the step.  If the step is not ``complete``, because
+    samples are missing, H may lack rank.
     """
     S = np.hstack((known, noise))
     if S.shape[1] < len(H):
@@ -507,7 +518,7 @@ def joint_step(
 def _regular(
     H: FloatArray, S: FloatArray, width: int, right: FloatArray, least: float
 ) -> tuple[SquareRootGaussian, SmootherGain] | None:
-    """Solve a step by LAPACK alone, or return ``None`` where a rank has to be decided."""
+    """Solve a step for smoothing by LAPACK, or return ``None`` where a rank has to be decided."""
     from scipy.linalg import solve_triangular
 
     projection = projection_of(H, least=least)
@@ -531,7 +542,7 @@ def _regular(
 def _by_rank(
     H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray
 ) -> tuple[SquareRootGaussian, SmootherGain]:
-    """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
+    """Solve a step for smoothing with decisions on all ranks."""
     n, columns = H.shape[1], right.shape[1]
     lengths, q1, q2, head, places, free = _by_columns(H, unknown)
     white, turned, count = _fixed_by_parity(q2, S, right)
@@ -541,13 +552,13 @@ def _by_rank(
         data = np.hstack((q1.T @ right + rotated[:, :count] @ white, rotated[:, count:]))
         solved[places] = _substituted(head, data)
     solved = solved / lengths[:, None]
-    # The part of the solution that is free: x and the coordinates d, in scaled units.
+    # The free part of the solution, in x and in the coordinates d, in scaled units.
     free = np.linalg.qr(free)[0] if free.shape[1] else free
     left_vectors, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
     undetermined = int(np.sum(values > RANK_TOLERANCE))
     basis, weights = np.linalg.qr(left_vectors[:, :undetermined] / lengths[:n, None])
     into = right_vectors[:undetermined].T @ (np.linalg.inv(weights) / values[:undetermined, None])
-    # What acts on x, in as few directions as it needs; the others only act on what came before.
+    # Noise that acts on x, in as few directions as possible; the other directions act only on earlier coordinates.
     spread = solved[:n, columns:]
     compact, triangle = np.linalg.qr(spread.T, mode="complete")
     most = min(n, spread.shape[1])
@@ -564,7 +575,8 @@ def _by_rank(
 
 
 def _fixed_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Return what the parity says of some directions of e, an orthogonal matrix that has these first, their number."""
+    """Return the values of e in the directions that the parity fixes, an orthogonal basis with these first, and their
+    number."""
     if not q2.shape[1]:
         return np.zeros((0, right.shape[1])), np.eye(S.shape[1]), 0
     sizes, (packed, order, tau, first), count = _parity(q2, S)
@@ -575,7 +587,7 @@ def _fixed_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[
 
 
 def stepped_back(later: SquareRootGaussian, back: SmootherGain) -> SquareRootGaussian:
-    """Return what is known of the coordinates before a step from what is known of those after it."""
+    """Return the smoothed coordinates before a step from the smoothed coordinates after it."""
     mean = back.offset + back.from_next @ later.mean
     factor = np.hstack((back.from_next @ later.factor, back.noise))
     if factor.shape[1] > len(factor):
@@ -588,7 +600,7 @@ def stepped_back(later: SquareRootGaussian, back: SmootherGain) -> SquareRootGau
 
 
 def nothing_later(width: int, unknown: int, columns: int) -> SquareRootGaussian:
-    """Return what a filter knows of its own coordinates: c ~ N(0, I), and nothing of d."""
+    """Return the coordinates at the last sample, without later data: c ~ N(0, I), and d unknown."""
     factor, diffuse = np.zeros((width + unknown, width)), np.zeros((width + unknown, unknown))
     factor[:width], diffuse[width:] = np.eye(width), np.eye(unknown)
     return SquareRootGaussian(np.zeros((width + unknown, columns)), factor, diffuse)
@@ -618,7 +630,7 @@ def update(
     directional: bool = False,
     noise: FloatArray | None = None,
 ) -> tuple[ParameterState, FloatArray]:
-    """Take in ``v = G theta + noise``; return the new state and the gain.
+    """Return the state after the data ``v = G theta + noise``, and the gain.
 
     ``M+ = lambda M + (1 - lambda) M_reg + G'G``, ``Theta = M+^-1 G'``, ``theta+ = theta + Theta (v - G theta)``, ``P+ =
     (I - Theta G) P (I - Theta G)' + Theta W W' Theta'``; M_reg bounds ``M^-1`` against wind-up.
@@ -657,7 +669,7 @@ def _scalar(
 
 
 def _directional(triangle: FloatArray, G: FloatArray, forgetting: float) -> FloatArray:
-    """Return the triangle after forgetting where G excites: ``M - (1 - lambda) G' (G S G')^-1 G``."""
+    """Return the triangle after forgetting in the directions that G excites: ``M - (1 - lambda) G' (G S G')^-1 G``."""
     if not len(G):
         return triangle
     # In coordinates in which the present information is the identity, the directions that G excites are orthogonal.

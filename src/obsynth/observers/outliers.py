@@ -1,10 +1,10 @@
 """Outliers: rules that reject samples far from their prediction, and limits of estimates by bounds of the states.
 
-Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975): the
-limit of its prediction, and where this excludes no sample of a row, that of what its others say of it.  Where
-the outliers of a log show how far off they are, what is nearer may be the onset of a fault, however many deviations it
-is.  A projection brings the error nowhere further in its metric: the covariance stays an upper bound (Simon, Chia
-2002).
+A sample beyond a limit is rejected (``gate``) or replaced by the limit (``huber``; Huber 1964, Masreliez 1975).  The
+limit is a number of standard deviations of the sample's prediction.  If no sample of a row exceeds it, each sample is
+also compared with its prediction from the other samples of the row.  Where the least size of a sensor's outliers is
+known, smaller deviations are not rejected: they may be the onset of a fault.  Projection onto bounds increases no error
+in the metric of the covariance, which therefore stays an upper bound (Simon, Chia 2002).
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ BoolArray = NDArray[np.bool_]
 
 Outliers = Literal["none", "gate", "huber"]
 
-#: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
+#: Default limits in standard deviations.  With that of the gate a true model rejects less than one sample in a million.
 LIMITS = {"gate": 6.0, "huber": 3.0}
 
-#: What is larger has no square: it is no measurement, whatever the model says.
+#: A larger number is no measurement, since its square overflows.
 NO_SQUARE = 1e150
 
-#: Samples of one sensor in a row that are left out where their sides change, or where its outliers are known to be far
-#: off, so that two may come together; else the second on one side is believed. So are those that follow it there,
-#: unless they are wild.
+#: Most consecutive samples of a sensor that are rejected if their deviations change sign, or if the sensor's outliers
+#: are known to be large.  Otherwise the second sample on the same side is accepted, and so are the following ones of
+#: comparable size.
 LONGEST_LEFT_OUT = 2
 
-#: Share of its limit that the least size of a sensor's outliers must be so that of two in a row both are left out:
-#: where what inputs may have been widens the limit beyond that, the second is believed.
+#: Outliers of a sensor count as large if their least size is at least this share of the limit.  Missing inputs widen
+#: the limit; the second of two consecutive samples is then accepted.
 FAR_OUT = 0.5
 
-#: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
-#: that grows with the square of time the second is 4 times further off, and noise moves both.
+#: Largest ratio of consecutive deviations for which the second sample confirms the first.  At the onset of a fault that
+#: grows with the square of time the ratio is 4, and noise changes both.
 COMPARABLE = 5.0
 
-#: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
-#: and what rounding makes of a prediction without noise.
+#: Multiple of the limit that a sample has to exceed if only the model's equations contradict it, and the relative
+#: rounding error of a prediction without noise.
 BLIND, PREDICTION_ROUNDING = 10.0, 1e-6
 
-#: Samples whose squared innovations are summed up before a reset.
+#: Number of samples whose squared innovations are summed for the decision on a reset.
 RESET_WINDOW = 20
 
 State = TypeVar("State", bound=Any)
@@ -64,8 +64,10 @@ def checked_limit(kind: str, limit: float | None) -> float:
 
 
 def checked_sizes(value: Any, names: Sequence[str]) -> FloatArray | None:
-    """Return how far off a sample of each output must be at least to be an outlier ``(ny,)``, in units of the sensor,
-    from these or from values by name; ``None`` where nothing is said."""
+    """Return the least deviation of an outlier of each output ``(ny,)`` in the sensor's unit, checked.
+
+    ``value`` is an array, or a mapping by name; ``None`` for no stated sizes.
+    """
     if value is None:
         return None
     sizes = named_vector(value, names, np.zeros(len(names)), "outlier_sizes")
@@ -77,9 +79,12 @@ def checked_sizes(value: Any, names: Sequence[str]) -> FloatArray | None:
 
 
 def no_refusals(outputs: int) -> FloatArray:
-    """Return the memory of outliers at a start, ``(4, ny)``: how many samples in a row of each sensor were far from
-    their prediction, negative where the last was below it; how many were left out or pulled at all; and how far off, in
-    units of the sensor and with its sign, the latest of those in a row was that was left out, and that was believed."""
+    """Return the memory of outliers before the first sample, ``(4, ny)``.
+
+    Its rows are, for each sensor: the number of consecutive samples far from their prediction, negative if the last one
+    was below; the total number of rejected or limited samples; and the deviations of the last rejected and the last
+    accepted one of those consecutive samples.
+    """
     return np.zeros((4, outputs))
 
 
@@ -96,15 +101,36 @@ def robust_advance(
     predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
     held: FloatArray | None = None,
 ) -> tuple[State, Row]:
-    """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers:
-    those further off than so many deviations, and than ``sizes (ny,)`` where these are known; where there are none, the
-    one that the others of its row exclude most.
-    ``predicted(state, received, u)``: mean ``(ny,)`` and covariance ``(ny, ny)`` of outputs from the samples that are
-    received; ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further
-    off.
-    ``held (nu,)``, where inputs are missing: as they last were. What these exclude, by deviations alone, may be wrong,
-    or the inputs have moved: it counts once the next sample goes on with it. So does what is as far off as outliers of
-    its sensor are once inputs are known again, until a sample is nearer or goes on with those before."""
+    """Return the state and the row after a step that rejects or limits outliers.
+
+    A plain step comes first.  If its normalised innovation exceeds the limit, each sample is tested, and the step is
+    repeated without the outliers: samples with a deviation above ``limit`` standard deviations and above ``sizes``.  If
+    there are none, the sample that the others of its row contradict most is the outlier.
+
+    Parameters
+    ----------
+    kind : {"none", "gate", "huber"}
+        What happens to outliers.
+    limit : float
+        Limit in standard deviations.
+    sizes : FloatArray or None
+        Least sizes of outliers ``(ny,)`` where they are known.
+    plain : callable
+        The step ``(state, y, u)`` without any rule; NaN marks a missing sample.
+    predicted : callable
+        ``(state, received, u)`` to mean ``(ny,)`` and covariance ``(ny, ny)`` of the outputs, given received samples.
+    state : State
+        The state before the step, with the memory `no_refusals` in ``refused``.
+    y, u : FloatArray
+        Outputs ``(ny,)`` and known inputs ``(nu,)``.
+    predicted_outputs : callable, optional
+        ``(state, u)`` to mean and covariance of outputs that determine the state; these are outliers only beyond
+        `BLIND` times the limit.
+    held : FloatArray, optional
+        Last values ``(nu,)`` of inputs that are missing now.  Deviating samples may then be right, since the inputs may
+        have moved: they are accepted if the next sample confirms them.  Once the inputs are known again, the same holds
+        for deviations as large as a sensor's outliers, until a sample deviates less or confirms the ones before.
+    """
     failed, mean, usual, reach, far = False, y, y, y, np.zeros(len(y), dtype=bool)
     least = np.zeros(len(y)) if sizes is None else sizes
     wary = None if sizes is None or kind != "gate" or held is not None else _wary(state, sizes)
@@ -122,19 +148,19 @@ def robust_advance(
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
-        # Beside a missing input nearer samples wait for the next one as well: no fault is reported in this row.
+        # With a missing input smaller deviations also wait for the next sample, so that this row reports no fault.
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
         mean, usual, reach, far, apart = _judged(limit, least, predicted, state, y, u_taken)
         if wary is not None:
-            # A second that is where the first was, and no further than it may be, goes on with it at once; so does one
-            # that is where the others of its row say.
+            # A second sample that repeats the first within the limit confirms it at once, and so does one that agrees
+            # with the other samples of its row.
             again = (np.abs(y - mean) <= reach) & (np.abs(y - mean - state.refused[2]) <= least)
             wary &= np.isfinite(reach) & ~(again & (state.refused[2] != 0.0)) & ~(np.abs(apart) <= least)
             reach = np.where(wary, least, reach)
             far |= wary & (np.abs(y - mean) > reach)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
-        # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
+        # An outlier is isolated; after a change of sensor or plant the next sample deviates as much to the same side.
         far_outliers = np.zeros(len(y), dtype=bool) if sizes is None else sizes > FAR_OUT * usual
         gone = far & (~_follows(state.refused, off, far_outliers) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
@@ -145,15 +171,18 @@ def robust_advance(
         if failed or gone.any():
             after, row = plain(state, received, u)
     except (SolverError, np.linalg.LinAlgError, ValueError):
-        # A sample that nothing predicts, and with which there is no step.
+        # There is no step with these samples: take the step without any.
         gone = ~np.isnan(y)
         after, row = plain(state, np.full(len(y), np.nan), u)
     return after._replace(refused=_remembered(state.refused, y, far, gone, off)), row
 
 
 def _wary(state: Any, sizes: FloatArray) -> BoolArray | None:
-    """Return of which sensors with known outliers ``(ny,)`` a sample waits for the next whatever its deviation: what
-    inputs may have been while they were missing makes it so large that an outlier would pass. `None`: of none."""
+    """Return the sensors ``(ny,)`` whose deviating samples need confirmation by the next one, or `None` for none.
+
+    After missing inputs the standard deviations are so large that an outlier would pass the limit.  Sensors with known
+    sizes of outliers then wait for the next sample.
+    """
     if state.inputs[3].any():
         return np.asarray(sizes > 0.0)
     waiting = state.refused[2]
@@ -161,9 +190,12 @@ def _wary(state: Any, sizes: FloatArray) -> BoolArray | None:
 
 
 def _follows(refused: FloatArray, off: FloatArray, far_outliers: BoolArray) -> BoolArray:
-    """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
-    far as the one that was left out: after `LONGEST_LEFT_OUT` of them, or on its side where the sensor's outliers are
-    not ``known (ny,)`` to be further off than any sample."""
+    """Return which samples, with deviations ``off (ny,)``, confirm earlier deviating ones.
+
+    A sample confirms an accepted one if it is on the same side with a comparable deviation.  It confirms a rejected one
+    if the deviations are comparable, and either they are on the same side, for sensors without ``far_outliers``, or
+    `LONGEST_LEFT_OUT` samples were rejected.
+    """
     row, _, left_out, believed = refused
     sizes, left_out_sizes = np.abs(off), np.abs(left_out)
     with np.errstate(over="ignore"):
@@ -175,8 +207,11 @@ def _follows(refused: FloatArray, off: FloatArray, far_outliers: BoolArray) -> B
 
 
 def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolArray, off: FloatArray) -> FloatArray:
-    """Return the memory of outliers after a sample, of which those that are ``far (ny,)`` are ``off`` by so much, and
-    some are ``gone``: left out or pulled. A missing sample leaves it as it was."""
+    """Return the memory of outliers after a row of samples; a missing sample does not change it.
+
+    ``far (ny,)`` are the samples that deviate, ``off (ny,)`` their deviations, and ``gone (ny,)`` the rejected or
+    limited ones.
+    """
     row, total, left_out, believed = refused
     counts = np.where(far, np.where(off < 0.0, -1.0, 1.0) * (np.abs(row) + 1.0), 0.0)
     after = np.stack([counts, total + gone, *(np.where(far, np.where(chosen, off, old), 0.0)
@@ -192,10 +227,13 @@ def _judged(
     y: FloatArray,
     u: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray]:
-    """Return the mean of each output, how far from it a sample may be by its deviation and at all, which are further,
-    and how far each is from what the others of its row say, NaN where they do not know it. Where the model alone
-    predicts nothing of an output, or excludes no sample, the others of its row judge: what a fault may have done makes
-    deviations large, but it moves all sensors together."""
+    """Return predictions and limits of all outputs, which samples exceed them, and deviations from the others.
+
+    The five arrays ``(ny,)`` are: the predicted mean; the limit by standard deviations; the limit with known sizes of
+    outliers; whether the sample exceeds it; and the deviation from the prediction by the other samples of the row, NaN
+    where there is none.  The other samples decide where the model predicts nothing of an output or no sample exceeds
+    its limit: possible faults make standard deviations large, but they move all sensors together.
+    """
     with np.errstate(all="ignore"):
         mean, covariance = predicted(state, np.full(len(y), np.nan), u)
         usual = limit * np.sqrt(np.diag(covariance))
@@ -210,7 +248,7 @@ def _judged(
                 continue
             mean[i], reach[i] = means[i], max(limit * np.sqrt(spread[i, i]), least[i])
             ratios[i] = np.abs(y[i] - means[i]) / reach[i]
-        # Of those that accuse each other, the worst alone.
+        # Samples may contradict each other: only the worst one is an outlier.
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > 1.0)
         apart = np.full(len(y), np.nan)
@@ -224,9 +262,11 @@ def _judged(
 
 
 def beside_others(off: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far each sample ``(ny,)`` is from what all others of its row say of it, and the deviation of that,
-    where they are ``off (ny,)`` their prediction by so much, with ``covariance (ny, ny)``; NaN of one that is missing,
-    and of all where the covariance is singular."""
+    """Return the deviation of each sample ``(ny,)`` from its prediction by the other samples, with standard deviations.
+
+    ``off (ny,)`` are the deviations from the model's prediction and ``covariance (ny, ny)`` is their covariance.  NaN
+    for a missing sample, and for all where the covariance is singular.
+    """
     distances = np.full((2, len(off)), np.nan)
     measured = np.flatnonzero(~np.isnan(off))
     sizes = np.sqrt(np.diag(covariance)[measured])
@@ -246,9 +286,11 @@ def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
 
 
 def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
-    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``. The shortest
-    e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the covariance
-    may be singular. The factor is ``(n, any)``."""
+    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``.
+
+    It is ``x + factor e`` with the shortest e within the bounds, by nonnegative least squares (Lawson, Hanson, LDP), so
+    that the covariance may be singular; ``factor (n, any)``.
+    """
     if ((bounds[:, 0] <= x) & (x <= bounds[:, 1])).all():
         return x
     from scipy.optimize import nnls
@@ -266,9 +308,9 @@ def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArr
     weights, distance = nnls(np.vstack((sides.T, least)), target)
     residual = np.vstack((sides.T, least)) @ weights - target
     moved = x
-    # Without a rest no e keeps all of them: a state that is known exactly stands in the way.
+    # A residual of zero means that no e keeps all bounds, because of a state that is known exactly.
     if distance > 0.0 and residual[-1] < 0.0:
-        # The shortest e that reaches the ends that hold it, without the cancellation of the ratio of residuals.
+        # Solve for the shortest e with the active bounds: the ratio of residuals would suffer from cancellation.
         held = weights > 0.0
         moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]
     return np.asarray(np.clip(moved, bounds[:, 0], bounds[:, 1]))
@@ -276,18 +318,18 @@ def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArr
 
 @lru_cache(maxsize=256)
 def chi_square_limit(degrees: int, probability: float) -> float:
-    """Return what a chi-square variable passes with a probability."""
+    """Return the value that a chi-square variable exceeds with the given probability."""
     from scipy.special import chdtri
 
     return float(chdtri(degrees, probability))
 
 
 def with_surprise(surprises: FloatArray, nis: float, degrees: int) -> FloatArray:
-    """Return the latest normalised squares of innovations with their degrees of freedom ``(any, 2)``, this one last."""
+    """Return the last normalised squares of innovations with their degrees of freedom ``(any, 2)``, with this one."""
     return np.vstack([surprises, [nis, float(degrees)]])[-RESET_WINDOW:]
 
 
 def has_jumped(surprises: FloatArray, probability: float) -> bool:
-    """Return whether the latest innovations are too large for what is known of the parameters."""
+    """Whether the last innovations are too large for the present covariance of the parameters."""
     total, degrees = surprises.sum(axis=0)
     return bool(degrees > 0) and bool(total > chi_square_limit(int(degrees), probability))

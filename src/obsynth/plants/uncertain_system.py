@@ -27,7 +27,7 @@ from obsynth.plants.uncertainty import (
 
 
 def stated_box(constants: Any, variation: str | None = None) -> Any:
-    """Return a calibrated box as a box of constants, with its level and digest; all else as it is."""
+    """Return a calibrated box as a box of constants with its level and digest; any other argument unchanged."""
     if not isinstance(constants, CalibratedBox):
         return constants
     return constants_box(
@@ -46,7 +46,7 @@ def uncertain_system(
     level: float | None = None,
     digest: str | None = None,
 ) -> DescriptorSystem:
-    """Return a linear plant that knows the tolerances of its constants.
+    """Return a linear plant with tolerances of its constants.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def with_expressions(
 ) -> DescriptorSystem:
     """Return a plant with expressions in some entries, at the nominal values of the constants."""
     names = set(constants.constants if isinstance(constants, ConstantsBox) else constants or {})
-    # What an expression puts into an entry is no number of its own, to have a tolerance of its own.
+    # An entry with an expression has no tolerance of its own.
     box, more = _boxed(constants, tolerance, {}, matrices_of(system), entries, options)
     return filled_plant(system, Uncertainty(box, _joined(entries, more)), names)
 
@@ -163,7 +163,7 @@ def _require_used(uncertainty: Uncertainty, stated: set[str]) -> None:
 def _with_tolerances(
     plant: DescriptorSystem, before: Uncertainty, constants: Any, tolerance: Any, options: Mapping[str, Any]
 ) -> DescriptorSystem:
-    """Return a plant that has constants with new tolerances of these; nominal values may not move."""
+    """Return a plant with new tolerances of its constants; the nominal values stay the same."""
     written = as_written(plant, before)
     entries = {name: list(items) for name, items in before.entries.items()}
     stated = {key: value for key, value in options.items() if value is not None}
@@ -191,7 +191,7 @@ def _with_tolerances(
 
 
 def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return where a box comes from after some of its tolerances were given anew."""
+    """Return the source of a box after some of its tolerances were replaced."""
     if isinstance(constants, ConstantsBox) or "source" in stated:
         return {}
     if box.source != "calibrated":
@@ -218,7 +218,7 @@ def _boxed(
     entries: Mapping[str, list[Entry]],
     options: Mapping[str, Any],
 ) -> tuple[ConstantsBox, dict[str, list[Entry]]]:
-    """Return the box, and entries that are constants of their own."""
+    """Return the box, and the matrix entries that are constants themselves."""
     if isinstance(constants, ConstantsBox):
         if not tolerance and not known.keys() - constants.constants.keys():
             return constants, {}
@@ -234,7 +234,7 @@ def _boxed(
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
     boxed, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
-    # A capacitance may be called C: what an expression names is a constant, and no tolerance of that matrix.
+    # A constant may have the name of a matrix, such as a capacitance C: names in expressions are constants.
     texts = [
         text for matrix, cells in entries.items() for row, column, text in cells if text != _entry(matrix, row, column)
     ]

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 @fields_suggested
 @dataclass(frozen=True, eq=False)
 class Spec:
-    """A spec, read and checked.
+    """A spec after reading and checking.
 
     Parameters
     ----------
@@ -53,26 +53,26 @@ class Spec:
     description : str
         Free text; empty if there is none.
     path : Path
-        The file it was read from.
+        The file of the spec.
     plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant as the method sees it, after the transformation.
+        The plant that the method designs for, after the transformation.
     transformation : Transformation, optional
-        What was done to the plant as written, and the way back.
+        The transformation of the plant as written, with the recovery of its states.
     method : str
         Identifier of the method.
     options : mapping
-        The options of the method that the spec gives, checked.
+        Options of the method, checked.
     scenario : Scenario, optional
-        What `obsynth.simulate` is asked to let happen.
+        The scenario for `obsynth.simulate`.
     model : DAEModel, optional
-        The nonlinear plant as written, where the plant is one, or is linearised from one.
+        The nonlinear plant as written, if the plant is nonlinear or a linearisation.
     calibrate : mapping, optional
-        What `obsynth.calibrate` is asked to find, as written; its log is looked up beside the spec.
+        Options of `obsynth.calibrate` as written; the path of the log is relative to the spec's folder.
     inputs : mapping, optional
         When the inputs of a row act: ``hold`` (``begins`` or ``ends``: during the step that begins or ends with the
         row) and ``delay`` (rows).
     noise : mapping, optional
-        Noise of the sensors, offsets and walks as written, for which the plant has states (`obsynth.with_noise`).
+        Sensor noise, offsets and random walks as written, for which the plant has states (`obsynth.with_noise`).
 
     Examples
     --------
@@ -100,15 +100,16 @@ class Spec:
         return f"<Spec {self.name!r} ({self.path}): {self.plant!r}, method {self.method}{scenario}>"
 
     def input_delay(self, plant: Any) -> int | None:
-        """Return rows by which a log's inputs act later than a plant takes them; ``None`` where the spec says nothing.
+        """Return by how many rows a log's inputs act later than a plant assumes; ``None`` if not stated.
 
-        Nonlinear plants take the inputs of a row during the step that ends there, others on samples during the one that
-        begins.  Without ``inputs.hold`` the delay is by the convention of the plant that is designed for.
+        Nonlinear plants assume that the inputs of a row act during the step that ends there; other plants on samples
+        assume the step that begins there.  Without ``inputs.hold`` the delay refers to the convention of the plant that
+        the spec designs for.
 
         Parameters
         ----------
         plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-            The one that takes the log.
+            The plant that runs on the log.
         """
         own = _takes_inputs(plant)
         if self.inputs is not None:
@@ -117,19 +118,19 @@ class Spec:
         delay = (self.calibrate or {}).get("input_delay")
         if not isinstance(delay, int):
             return None
-        # What a calibration of a nonlinear plant found is by the convention of that plant.
+        # A calibrated delay of a nonlinear plant refers to the convention of that plant.
         sampled = isinstance(plant, DescriptorSystem) and plant.is_discrete and self.model is not None
         return delay - int(sampled)
 
 
 def _takes_inputs(plant: Any) -> str:
-    """Return when a plant takes the inputs of a row, by the words of ``inputs.hold``."""
+    """Return when the inputs of a row act on a plant, as a value of ``inputs.hold``."""
     nonlinear = isinstance(plant, DAEModel) or (isinstance(plant, DescriptorSystem) and not plant.is_discrete)
     return "ends" if nonlinear else "begins"
 
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
-    """Return the nonlinear plant of a spec, with the spec, or of a file that holds a plant alone."""
+    """Return the nonlinear plant of a spec or of a plant file, and the spec, if there is one."""
     plant, spec = load_plant(path)
     if not isinstance(plant, DAEModel):
         raise SpecError(f"{path} holds no nonlinear plant (kind: dae).", path=str(path))
@@ -139,8 +140,10 @@ def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
 def load_plant(
     path: str | Path,
 ) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
-    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone; one over
-    a region is refused, as nothing is fitted to it."""
+    """Return the plant as written of a spec or of a plant file, and the spec, if there is one.
+
+    A plant over a region raises `SpecError`: it cannot be fitted to a log.
+    """
     source = Path(path)
     document = read_yaml(source)
     spec = None
@@ -160,12 +163,12 @@ def load_plant(
 
 @arguments_checked
 def load_spec(path: str | Path) -> Spec:
-    """Read a spec; check it strictly; build its plant and transform it as asked.
+    """Read and check a spec, and build its plant with the requested transformations.
 
     Parameters
     ----------
     path : str or Path
-        A YAML 1.2 document.  Files it refers to are looked up in its own folder.
+        A YAML 1.2 document.  Paths in it are relative to its folder.
 
     Returns
     -------
@@ -175,10 +178,10 @@ def load_spec(path: str | Path) -> Spec:
     Raises
     ------
     SpecError
-        The document or a file it refers to is malformed; as many problems as can be found at once, each
+        The document, or a file that it refers to, is malformed.  The error lists as many problems as possible, each
         with its path.
     PreconditionError
-        The plant cannot be transformed as asked, for example because its index is not one.
+        A requested transformation does not exist, for example because the plant's index is not one.
 
     Examples
     --------
@@ -200,7 +203,7 @@ def load_spec(path: str | Path) -> Spec:
 def design_of_spec(
     spec: Spec, *, name: str | None = None, progress: Callable[[str], None] | None = None
 ) -> ObserverDesign:
-    """Return the design that a spec asks for, proved, with what its transformation says and when its inputs act."""
+    """Return the verified design of a spec, with the notes of its transformation and the delay of its inputs."""
     from obsynth.methods.designing import design
 
     done, late = spec.transformation, spec.input_delay(spec.plant)
@@ -224,9 +227,10 @@ def spec_of(
     plant_changes: Mapping[str, Any] | None = None,
     with_states: bool = True,
 ) -> Spec:
-    """Return the spec that a document stands for, as if it were in ``source``; a plant in a file may be changed.
+    """Return the spec of a document, as if it were the file ``source``.
 
-    ``with_states``: whether the plant gets states for noise that is not white, offsets and walks.
+    ``plant_changes`` change entries of a plant in a file of its own.  ``with_states``: add states for coloured noise,
+    offsets and random walks to the plant.
     """
     checked, raw_options = checked_spec(document, source)
     reference: Any = checked.plant if hasattr(checked.plant, "file") else None
@@ -282,7 +286,7 @@ def spec_of(
 
 
 def _options_as_read(raw_options: Mapping[str, Any], source: Path) -> dict[str, Any]:
-    """Return the options of the method with matrices read from the files that they name."""
+    """Return the options of the method, with matrices from the files that they refer to."""
     problems = DocumentProblems(source, what="spec")
     options = {
         name: read_value(value, source.parent, f"method.options.{name}", problems)
@@ -295,7 +299,7 @@ def _options_as_read(raw_options: Mapping[str, Any], source: Path) -> dict[str, 
 def _steps_of_linear_plant(
     plant: DescriptorSystem, noisy: Transformation | None, transform: tuple[TransformSection | None, Path, str]
 ) -> Transformation | None:
-    """Return states for noise, then what the spec asks for, as one transformation; ``None`` where there is neither."""
+    """Return the addition of noise states and the transformations of the spec as one; ``None`` where there is none."""
     before = plant if noisy is None else noisy.plant
     if transform[0] is None and not before.delays:
         return noisy
@@ -307,7 +311,7 @@ def _steps_of_linear_plant(
 
 
 def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tuple[Any, Path, str, Any]:
-    """Return the section of a plant, the file and place in it where it stands, and the plant of another tool."""
+    """Return the section of a plant, its file, its path in the file, and the plant if another tool's file holds it."""
     imported = imported_plant(section, source) if hasattr(section, "file") else None
     if imported is not None or not hasattr(section, "file"):
         return section, source, "plant", imported
@@ -316,7 +320,7 @@ def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tu
 
 
 def _checked_inputs(section: Any, plant: object, source: Path) -> dict[str, Any] | None:
-    """Return how a log tells the known inputs, as plain data; ``None`` where nothing is said of that."""
+    """Return the section ``inputs`` as plain data, checked; ``None`` where the spec has none."""
     inputs: dict[str, Any] | None = None if section is None else section.model_dump()
     if inputs is not None and inputs["hold"] and isinstance(plant, DescriptorSystem) and not plant.is_discrete:
         raise SpecError(
@@ -328,7 +332,7 @@ def _checked_inputs(section: Any, plant: object, source: Path) -> dict[str, Any]
 
 
 def _placed_noise(plant: Any, noise: Mapping[str, Any], source: Path, prefix: str, **more: Any) -> Any:
-    """Return what `with_noise` makes of a plant; an error gets its place in the document."""
+    """Return the result of `with_noise` for a plant; an error gets its place in the document."""
     from obsynth.plants.transformations.noise_states import with_noise
 
     try:
@@ -346,7 +350,7 @@ def _noisy_model(
     source: Path,
     prefix: str,
 ) -> tuple[DAEModel, dict[str, Any]]:
-    """Return a nonlinear plant with states for its noise, and the options of its method with variances from it."""
+    """Return a nonlinear plant with states for its noise, and the method's options with the resulting variances."""
     steps = {"integration": options["integration"]} if options.get("integration") == "radau" else {}
     arguments = {"process_noise": section.process_noise, "dt": options.get("dt"), **steps}
     made, more = _placed_noise(model, noise, source, prefix, **arguments)
@@ -354,7 +358,7 @@ def _noisy_model(
 
 
 def _with_options(options: Mapping[str, Any], more: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Return options with others that the method has, where they are not given; of those by name, what is missing."""
+    """Return options with defaults ``more`` for those that the method has; mappings by name are merged."""
     known = {field.name for field in fields(method_class(method))} if method in REGISTRY else set()
     merged = dict(options)
     for name, value in more.items():
@@ -376,7 +380,7 @@ def _linearised(
     source: Path,
     prefix: str,
 ) -> DescriptorSystem | None:
-    """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
+    """Return the linear model of a nonlinear plant if the spec requests one; ``folder``: the folder of its file."""
     constants, box = boxed_constants(section, folder)
     tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
     if transform is None:
@@ -424,7 +428,7 @@ def _linearised(
 def _transformed(
     transform: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
 ) -> Transformation | None:
-    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
+    """Return the requested elimination of algebraic states, sampling, or both; ``None`` where neither is requested."""
     late = plant.is_discrete and bool(plant.delays)
     if transform is None or not (
         transform.eliminate_algebraic_states or transform.sample_time is not None or transform.pade
@@ -457,7 +461,7 @@ def _transformed(
 
 
 def changed_document(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with values at dotted paths put in place of those there; mappings on the way are made."""
+    """Return a document with values at dotted paths replaced; missing mappings on the way are created."""
     changed = dict(document)
     for path, value in changes.items():
         first, _, below = path.partition(".")

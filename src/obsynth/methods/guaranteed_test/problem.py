@@ -1,4 +1,4 @@
-"""The problem of a guaranteed test from its options: the windows, and the programme of each row."""
+"""The problem of a guaranteed test, made from its options: windows of samples, and a linear programme for each row."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.proofs.exact_pencils import ExactPencil
 from obsynth.proofs.nonsingular import is_nonsingular_exactly
 
-#: What each course covers, and what not.
+#: For each fault profile, the faults that it covers, and those that it does not.
 COURSES: Mapping[str, str] = {
     "constant": "a fault that is constant over the window: the interval holds once it fills the window, an alarm is "
     "always right",
@@ -33,19 +33,19 @@ COURSES: Mapping[str, str] = {
     "rate": "a fault that changes by at most fault_rate a sample: the interval is of its value at one sample",
 }
 
-#: Samples that are tried for ``samples="auto"``; for a step, those after its healthy past.
+#: Numbers of samples that ``samples="auto"`` tries; for a step, after its healthy samples.
 CANDIDATE_LENGTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
-#: The ladder ends where a window has more states than this.
+#: Longer windows are not tried if they have more states than this.
 MOST_WINDOW_STATES = 2500
 
-#: The least number of samples whose threshold is within this share of the last one's is taken.
+#: ``samples="auto"`` takes the least number of samples with a threshold within this share of the one of the longest.
 WITHIN = 0.05
 
-#: Rows, evenly spread, whose windows decide on the number of samples and the lag where matrices change with k.
+#: Number of evenly spread rows that decide on the number of samples and the lag of a time-varying plant.
 TRIED_ROWS = 8
 
-#: What is for plants with constant matrices, and what to do instead.
+#: Options for plants with constant matrices only, with the alternative for other plants.
 REFUSED: Mapping[str, str] = {
     "isolate": "design one test for each fault, insensitive to the others (free: others)",
     "exact": "leave it out: the fixed tests, one a row, are proved",
@@ -55,50 +55,50 @@ REFUSED: Mapping[str, str] = {
 
 @dataclass(frozen=True, eq=False)
 class WindowProblem:
-    """A plant with its bounds and what is asked, but for the number of samples, the lag and the row.
+    """A plant with bounds and a fault to be detected; number of samples, lag and row are still free.
 
-    Of a plant that changes with k, ``E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + Phi_k f(k) + mu(k)`` and
-    ``y(k+1) = C_{k+1} x(k+1) + Psi_k f(k) + nu(k)``, each row has a window of its own.
+    A time-varying plant, ``E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + Phi_k f(k) + mu(k)`` and
+    ``y(k+1) = C_{k+1} x(k+1) + Psi_k f(k) + nu(k)``, has a separate window for each row.
     """
 
     plant: DescriptorSystem | TimeVaryingDescriptorSystem
     bounds: Bounds
-    test_problem: TestProblem  # of one sample more than its course needs
+    test_problem: TestProblem  # with one sample more than the fault profile needs
 
     def window(self, samples: int, *, lag: int | None = None, row: int = 0) -> Window:
-        """Return the stacked equations of so many samples, of which the last is that of k = ``row``."""
+        """Return the stacked equations of a window of samples, the last one at k = ``row``."""
         lag = self.test_problem.lag if lag is None else lag
         start = 1 if self.horizon is None else row - samples + 1
         return window_of(self.plant, self.bounds, replace(self.test_problem, samples=samples, lag=lag), start)
 
     @property
     def horizon(self) -> int | None:
-        """The last k of a plant that changes with k."""
+        """The last k of a time-varying plant; ``None`` for constant matrices."""
         return None if isinstance(self.plant, DescriptorSystem) else self.plant.horizon
 
     @property
     def fault(self) -> str:
-        """Name of the fault that is looked for."""
+        """Name of the fault to be detected."""
         return fault_names(self.plant)[self.test_problem.fault]
 
     @property
     def shortest(self) -> int:
-        """The least number of samples that the course fits in."""
+        """The least number of samples for the fault profile."""
         return max(self.test_problem.before, self.test_problem.lag) + 1
 
     def enough(self, lag: int) -> int:
-        """Return samples after which more of them make no test possible that there was none before."""
+        """Return a number of samples that is enough: if it allows no test, no larger number does."""
         return self.test_problem.before + 2 * self.plant.nx + 2 + lag
 
     def ladder(self) -> tuple[int, ...]:
-        """Return the numbers of samples to try; of a large plant fewer."""
+        """Return the numbers of samples to try; fewer for a large plant."""
         most = max(MOST_WINDOW_STATES // max(self.plant.nx, 1), self.shortest)
         most = most if self.horizon is None else min(most, self.horizon)
         lengths = [self.test_problem.before + rung for rung in CANDIDATE_LENGTHS]
         return tuple(rung for rung in lengths if self.shortest <= rung <= most) or (self.shortest,)
 
     def rows(self, samples: int) -> range:
-        """Return the rows that have a window; without a horizon 0, which stands for all."""
+        """Return the rows with a window of their own; without a horizon row 0, which represents all."""
         return range(1) if self.horizon is None else range(samples, self.horizon + 1)
 
     def tried(self, samples: int) -> list[int]:
@@ -108,10 +108,10 @@ class WindowProblem:
 
     @cached_property
     def _continuing(self) -> np.ndarray:
-        """By k, whether every state that satisfies the equations up to it has a course to the horizon."""
+        """For each k, whether every state that satisfies the equations up to k has a continuation to the horizon."""
         plant = self.plant
         if isinstance(plant, DescriptorSystem):
-            # What follows the window is in its equations (`Question.closing`).
+            # The window's equations contain the ones after it (`TestProblem.closing`).
             return np.ones(1, dtype=bool)
         last = 2 if plant.horizon is None else plant.horizon
         continuing = np.ones(last + 1, dtype=bool)
@@ -121,9 +121,9 @@ class WindowProblem:
 
     @cached_property
     def _preceded(self) -> np.ndarray:
-        """By k, whether every state there has a past: equations before a window of a running plant say nothing of it.
+        """For each k, whether every state has a past, so that equations before a window do not restrict its states.
 
-        They do where A is singular, as that of a delay: what it holds is what went into it.
+        They do restrict them where A is singular, as for a delay, whose states are earlier inputs.
         """
         plant = self.plant
         if isinstance(plant, DescriptorSystem):
@@ -134,9 +134,9 @@ class WindowProblem:
         return np.array([True, *np.logical_and.accumulate(alone)])
 
     def has_past(self, row: int, samples: int) -> bool:
-        """Whether every state at the first sample of a window is one of a plant that has been running.
+        """Whether a running plant can have every state at the first sample of a window.
 
-        With bounds of the first state the plant starts with the window, by assumption.
+        With bounds on the initial state the plant starts with the window, by assumption.
         """
         if np.isfinite(self.bounds.first).any():
             return True
@@ -144,13 +144,13 @@ class WindowProblem:
         return bool(preceded[0 if self.horizon is None else min(row - samples + 1, len(preceded) - 1)])
 
     def continues(self, window: Window, row: int) -> bool:
-        """Whether what satisfies the equations of a window satisfies those after it, with some later states."""
+        """Whether every solution of a window's equations can be continued to the equations after it."""
         continuing = self._continuing
         after = 1 if self.horizon is None else row - window.test_problem.samples + 1 + window.equations
         return bool(continuing[min(after, len(continuing) - 1)])
 
     def is_of_a_running_plant(self, window: Window, row: int, point: FloatArray, radius: FloatArray) -> bool:
-        """Whether a point within a radius of this one ``(columns,)`` satisfies equations before and after a window."""
+        """Whether a solution within a radius of this one ``(columns,)`` has a continuation before and after it."""
         first = [place for place, label in enumerate(window.labels) if label[:2] == ("x", 0)]
         # A plant that starts at rest, exactly, has been at rest.
         at_rest = not np.any(point[first]) and not np.any(radius[first])
@@ -158,7 +158,7 @@ class WindowProblem:
 
 
 def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
-    """Whether a state with any ``E_k x`` can also satisfy those equations of the next step that E has no part in."""
+    """Whether the algebraic equations of the next step restrict no value of ``E_k x``."""
     rank = decide_rank(after).rank
     if rank == len(after):
         return True
@@ -167,7 +167,7 @@ def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
 
 
 def test_problem_of(options: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
-    """Return what is looked for, of one sample more than its course needs."""
+    """Return fault, disturbances and profiles from the options, with one sample more than the fault profile needs."""
     names, before = fault_names(plant), options.before if options.course == "step" else 0
     fault, rates = fault_of(names, options.fault), np.zeros(0)
     if options.disturbance == "rate":
@@ -192,8 +192,13 @@ def test_problem_of(options: TestOptions, plant: DescriptorSystem | TimeVaryingD
 
 
 def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> WindowProblem:
-    """Return what is asked of a plant; raise `SpecError` for what it cannot be asked, unknown signals, missing bounds
-    and courses that do not fit."""
+    """Return the problem that options pose for a plant.
+
+    Raises
+    ------
+    SpecError
+        An option is not for this kind of plant, a signal is unknown, a bound is missing, or a profile does not fit.
+    """
     if isinstance(plant, TimeVaryingDescriptorSystem):
         for name, is_chosen in (
             ("isolate", options.isolate),
@@ -229,7 +234,7 @@ def samples_given(options: TestOptions) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class WindowProgrammes:
-    """The different windows of all rows, the first row of each, and which window each row has ``(rows,)``."""
+    """The distinct windows of all rows, the first row of each, and the index of each row's window ``(rows,)``."""
 
     windows: tuple[Window, ...]
     first: tuple[int, ...]
@@ -237,7 +242,7 @@ class WindowProgrammes:
 
     @classmethod
     def of(cls, problem: WindowProblem, samples: int) -> WindowProgrammes:
-        """Return them; those with the same numbers are one."""
+        """Return the windows of a problem; windows with the same numbers count once."""
         numbers: dict[bytes, int] = {}
         windows: list[Window] = []
         first: list[int] = []
@@ -259,11 +264,11 @@ class WindowProgrammes:
 
 
 def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> WindowProblem:
-    """Return the problem of options as a design ships them: with the lag."""
+    """Return the problem of the options of a finished design, which state the lag."""
     problem = problem_of(plant, options)
     return replace(problem, test_problem=replace(problem.test_problem, lag=options.lag or 0))
 
 
 def window_as_designed(plant: DescriptorSystem, options: TestOptions) -> Window:
-    """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
+    """Return the stacked equations of a finished design, whose options state the number of samples and the lag."""
     return problem_as_designed(plant, options).window(int(options.samples))
