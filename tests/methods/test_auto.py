@@ -23,6 +23,38 @@ def test_the_design_names_the_method_and_why(tmp_path: Path) -> None:
     assert obsynth.load(found.save(tmp_path / "gains.json")).method == "functional-filter"
 
 
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=[] if seed < 1 else pytest.mark.long) for seed in range(4)])
+def test_the_choice_does_not_depend_on_units(seed: int) -> None:
+    # A gain of 1e-3 in whatever units these are counted as none: with the unknown input in other units the choice was
+    # another one for 13 of 14 random plants.
+    rng = np.random.default_rng([7, seed])
+    a = rng.standard_normal((3, 3))
+    given = {
+        "A": 0.8 * a / np.max(np.abs(np.linalg.eigvals(a))),
+        "C": rng.standard_normal((2, 3)),
+        "Bf": rng.standard_normal((3, 1)),
+        "Bd": rng.standard_normal((3, 1)),
+    }
+    noise = {"y1": 0.1, "y2": 0.1}
+    chosen = obsynth.design(obsynth.DescriptorSystem(**given, dt=1.0, sensor_noise=noise)).method
+    for name, factor in (("Bd", 1e-5), ("Bd", 1e5), ("Bf", 1e-5), ("Bf", 1e5)):
+        plant = obsynth.DescriptorSystem(**{**given, name: factor * given[name]}, dt=1.0, sensor_noise=noise)
+        assert obsynth.design(plant).method == chosen
+    kilo = {name: 1e3 * deviation for name, deviation in noise.items()}
+    plant = obsynth.DescriptorSystem(**{**given, "C": 1e3 * given["C"]}, dt=1.0, sensor_noise=kilo)
+    assert obsynth.design(plant).method == chosen
+
+
+def test_an_unknown_input_counts_as_the_fault_that_moves_the_outputs_as_much() -> None:
+    # The estimate is the output less its prediction: what is added to the state at once, of either.
+    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[2.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    design = obsynth.fault_estimation_filter(plant)
+    loaded = plant.replace(Bd=[[6e-4]])
+    (figures,) = fault_figures(loaded, design.observer, 60)
+    assert figures.unknown_input_gain == pytest.approx(3e-4, rel=1e-9)
+    assert figures.unknown_input_share == pytest.approx(1.0, rel=1e-9)
+
+
 def test_an_estimate_as_slow_as_the_plant_comes_after_faster_ones() -> None:
     # A heater with three masses: averaging for as long as the plant settles has the least noise, but nobody waits.
     e, a = np.diag([900.0, 400, 2500, 0]), [[-6, 0, 0, 6], [0, -9, 1, 8], [0, 1, -3, 0], [6, 8, 0, -14]]

@@ -8,6 +8,7 @@ from typing import Any
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.candidates import Candidate, Maker, candidate_designs, linear_methods, methods_with
+from obsynth.methods.fault_figures import largest_gain
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Purpose
 from obsynth.methods.registry import kind_of, methods_for
@@ -86,10 +87,9 @@ def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSyst
     """Return in one sentence why a candidate ranks first."""
     if not ranked_below:
         return "no other method exists for this plant"
-    gain = max(fault.unknown_input_gain for fault in best.figures)
     parts = ["its estimates reach every step"] if best.rank(False)[0] == 0.0 else []
     if plant.nd:
-        parts.append(f"gain from the unknown inputs {gain:.1e}")
+        parts.append(f"gain from the unknown inputs {largest_gain(best.figures):.3g}")
     deviation = ", ".join(f"{fault.deviation:.3g}" for fault in best.figures)
     delay = ", ".join(f"{fault.most:.3g}" for fault in best.figures)
     parts.append(f"90 % of a step after {delay} s, with a deviation of {deviation}")

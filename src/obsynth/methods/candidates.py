@@ -24,7 +24,8 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
 
-#: A fault estimate counts as decoupled if its peak gain from every unknown input, in fault per input, is at most this.
+#: A fault estimate counts as decoupled if an unknown input shows in it as at most this share of the fault that moves
+#: the outputs as much.
 DECOUPLED = 1e-3
 
 #: Number of samples in the settling time of a continuous plant, where no sample time is stated.
@@ -126,7 +127,7 @@ class Candidate:
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(fault.reaches for fault in self.figures))
-        coupled = float(has_unknown_inputs and any(fault.unknown_input_gain > DECOUPLED for fault in self.figures))
+        coupled = float(has_unknown_inputs and any(fault.unknown_input_share > DECOUPLED for fault in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides the deviation by the root of T and delays by T: averaging keeps this product.
         products = [fault.deviation * np.sqrt(max(fault.most, dt)) for fault in self.figures]

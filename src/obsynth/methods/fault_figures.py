@@ -6,8 +6,7 @@ one impulse at each input, so that plants with modes on the boundary need no sta
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,6 +22,9 @@ from obsynth.plants.transformations.elimination import eliminate_algebraic_state
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.simulation.linear import stabilising_feedback
+
+#: Rounding alone leaves at most this share of the fault that moves the outputs as much as an unknown input.
+ROUNDED_SHARE = 1e-9
 
 #: Shares of a step at which its delay is read.
 DELAY_SHARE, NEARLY_ALL = 0.5, 0.9
@@ -53,6 +55,8 @@ class FaultFigures:
         Standard deviation under the stated noise.
     unknown_input_gain : float
         Largest gain of a held sinusoidal unknown input to the estimate, per unit of the input.
+    unknown_input_share : float, dimensionless
+        The same, as a share of the fault that moves the outputs as much as the unknown input does.
 
     Examples
     --------
@@ -71,17 +75,17 @@ class FaultFigures:
     horizon: float
     deviation: float
     unknown_input_gain: float
-
-    @property
-    def leak(self) -> float:
-        """Deprecated: `unknown_input_gain`."""
-        warnings.warn("leak is now unknown_input_gain.", DeprecationWarning, stacklevel=2)
-        return self.unknown_input_gain
+    unknown_input_share: float
 
     @property
     def reaches(self) -> bool:
         """Whether a step is there at the horizon."""
         return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
+
+
+def largest_gain(figures: Iterable[FaultFigures]) -> float:
+    """Return the largest gain from an unknown input to an estimate; zero where all are rounding."""
+    return max((each.unknown_input_gain for each in figures if each.unknown_input_share > ROUNDED_SHARE), default=0.0)
 
 
 # Methods and figures ask for that of the same plant, which never changes.
@@ -118,40 +122,75 @@ def step_responses(
     plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return responses to impulses ``(steps, faults, nf + nd + nw)`` and to steps ``(steps, faults, nf)``."""
-    order, rows = observer.order, observer.fault_rows
+    rows = observer.fault_rows
     # Where no noise is stated, every output has one of its own, of deviation one.
     silent = not plant.Dw.any() and not plant.Bw.any()
     driven, measured = (np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)) if silent else (plant.Bw, plant.Dw)
     inputs = np.hstack([plant.Bf, plant.Bd, driven])
     direct = np.hstack([plant.Df, plant.Dd, measured])
-    # A feedback u = -feedback x is known to the observer: it changes no estimate, and keeps numbers small.
-    gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
-    output_map = plant.C - plant.D @ gain
-    moved, into = plant.A - plant.B @ gain, observer.By @ output_map - observer.Bu @ gain
-    a = np.block([[moved, np.zeros((plant.nx, order))], [into, observer.Az]])
-    b = np.vstack([inputs, observer.By @ direct])
-    c = np.hstack([observer.Dy[rows] @ output_map - observer.Du[rows] @ gain, observer.Cz[rows]])
-    first = observer.Dy[rows] @ direct
+    moved, signals = _held(plant, feedback)
+    into, through = np.hstack([observer.By, observer.Bu]), np.hstack([observer.Dy, observer.Du])[rows]
+    direct = np.vstack([direct, np.zeros((plant.nu, direct.shape[1]))])
+    a = np.block([[moved, np.zeros((plant.nx, observer.order))], [into @ signals, observer.Az]])
+    b = np.vstack([inputs, into @ direct])
+    c = np.hstack([through @ signals, observer.Cz[rows]])
+    first = through @ direct
     responses = np.concatenate([first[None], impulse_responses(a, b, c, steps - 1)])
     return responses, np.cumsum(responses[:, :, : plant.nf], axis=0)
 
 
+def _held(plant: DescriptorSystem, feedback: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """Return the dynamics ``(nx, nx)`` of a sampled plant under a feedback u = -feedback x, and what of the states its
+    outputs and inputs show ``(ny + nu, nx)``.
+
+    The observer knows this input: it changes no estimate, and keeps numbers small."""
+    gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
+    return plant.A - plant.B @ gain, np.vstack([plant.C - plant.D @ gain, -gain])
+
+
+def _faults_that_move_as_much(plant: DescriptorSystem, steps: int, feedback: FloatArray) -> FloatArray:
+    """Return how large faults are that move the outputs as much as one of each unknown input ``(nf, nd)``.
+
+    Largest gains over frequency are compared, of the outputs in their noise; where not all have some, of each output
+    in what the fault does to it.  No unit of a signal plays a part."""
+    moved, signals = _held(plant, feedback)
+    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
+    later = impulse_responses(moved, inputs, signals[: plant.ny], steps - 1)
+    peaks = np.abs(np.fft.rfft(np.concatenate([direct[None], later]), axis=0)).max(axis=0, initial=0.0)
+    of_faults, of_unknown = peaks[:, : plant.nf], peaks[:, plant.nf :]
+    noise = np.linalg.norm(plant.Dw, axis=1)
+    sizes = np.tile(noise[:, None], plant.nf) if np.all(noise > 0.0) else of_faults
+    weights = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
+    effects = np.linalg.norm(weights * of_faults, axis=0)
+    unknown = np.sqrt((weights**2).T @ of_unknown**2)
+    return np.asarray(np.divide(unknown, effects[:, None], out=np.zeros_like(unknown), where=effects[:, None] > 0.0))
+
+
 def fault_figures(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FaultFigures, ...]:
     """Return the figures of every fault that a sampled observer estimates on a sampled plant ``(E = I)``."""
-    impulse, step = step_responses(plant, observer, *steps_in_bounds(plant, steps))
+    followed, feedback = steps_in_bounds(plant, steps)
+    impulse, step = step_responses(plant, observer, followed, feedback)
     unknown = impulse[:, :, plant.nf : plant.nf + plant.nd]
     noise = impulse[:, :, plant.nf + plant.nd :]
     # An observer that runs away has figures beyond all numbers, and needs no warning besides.
     with np.errstate(over="ignore", invalid="ignore"):
-        return tuple(_figures(plant, observer, step, unknown, noise))
+        alike = _faults_that_move_as_much(plant, followed, feedback)
+        return tuple(_figures(plant, observer, step, unknown, noise, alike))
 
 
 def _figures(
-    plant: DescriptorSystem, observer: LinearObserver, step: FloatArray, unknown: FloatArray, noise: FloatArray
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    step: FloatArray,
+    unknown: FloatArray,
+    noise: FloatArray,
+    alike: FloatArray,
 ) -> Iterator[FaultFigures]:
     for row, name in enumerate(observer.fault_names):
         own = step[:, row, plant.fault_names.index(name)]
-        gains = np.abs(np.fft.rfft(unknown[:, row], axis=0))
+        gains = np.abs(np.fft.rfft(unknown[:, row], axis=0)).max(axis=0, initial=0.0)
+        sizes = alike[plant.fault_names.index(name)]
+        shares = np.divide(gains, sizes, out=np.zeros_like(gains), where=sizes > 0.0)
         yield FaultFigures(
             name,
             _first(own >= DELAY_SHARE, plant.dt),
@@ -161,6 +200,7 @@ def _figures(
             len(own) * plant.dt,
             float(np.sqrt(np.sum(noise[:, row] ** 2))),
             float(np.max(gains, initial=0.0)),
+            float(np.max(shares, initial=0.0)),
         )
 
 

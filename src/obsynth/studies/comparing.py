@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.methods.candidates import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import agree, design
-from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
+from obsynth.methods.fault_figures import largest_gain, on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import method_class
@@ -36,7 +36,7 @@ from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.studies.compared_methods import ComparedMethod, FaultComparison
 from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
-from obsynth.studies.comparison import ROUNDED_GAIN, Comparison
+from obsynth.studies.comparison import Comparison
 from obsynth.studies.equal_delays import (
     HEALTHY_TIME,
     delay_of_scenario,
@@ -507,9 +507,9 @@ def _reason(
         words.insert(0, delay_in_words(best.equal_delay, HEALTHY_TIME))
         if other_designs and other_designs[0].equal_delay is not None:
             words[0] += f", against {short_delay(other_designs[0].equal_delay)} by {other_designs[0].method}"
-    gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
-        words.append(f"gain from unknown inputs {gain:.3g}" if gain > ROUNDED_GAIN else "decoupled from unknown inputs")
+        gain = largest_gain(fault.figures for fault in best.faults)
+        words.append(f"gain from unknown inputs {gain:.3g}" if gain else "decoupled from unknown inputs")
     if not best.fast_enough:
         words.append("though none reaches 90 % of a step within the time asked for")
     slow = [entry for entry in other_designs if not entry.fast_enough] if best.fast_enough else []

@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
+from obsynth.methods.fault_figures import largest_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import fields_suggested, there_are
 from obsynth.observers.linear.observer import LinearObserver
@@ -71,8 +72,8 @@ _BOUND_COLUMN, _SHARE_COLUMNS = _HEADER.index("bound") - 3, slice(-2, None)
 _NEVER_COLUMNS = tuple(_HEADER.index(name) - 3 for name in ("s to alarm", "smallest"))
 #: Where times of a step stand, which are followed for as long as the runs: no more is known of later ones.
 _TIME_COLUMNS = tuple(_HEADER.index(name) - 3 for name in ("s to 50 %", "s to 90 %"))
-#: A gain, or a bound as a share of the fault, of at most this is zero but for rounding, and is shown as zero.
-ROUNDED_GAIN = 1e-9
+#: A bound of at most this share of the fault is zero but for rounding, and is shown as zero.
+ROUNDED_BOUND = 1e-9
 
 #: What the columns of numbers mean.
 _FIGURE_MEANINGS = {
@@ -193,7 +194,7 @@ class Comparison:
                     if np.isinf(figures[column]):
                         texts[column] = f"> {number(fault.figures.horizon, digits=3)}"
                 if np.isfinite(fault.bound):
-                    is_rounding = fault.bound <= ROUNDED_GAIN * fault.size
+                    is_rounding = fault.bound <= ROUNDED_BOUND * fault.size
                     texts[_BOUND_COLUMN] = "0" if is_rounding else upper_number(fault.bound)
                 if k:
                     # What is of the method stands in its first row.
@@ -418,7 +419,7 @@ def _figures(entry: ComparedMethod, fault: FaultComparison) -> tuple[float, ...]
         figures.at_horizon,
         figures.peak,
         figures.deviation,
-        0.0 if figures.unknown_input_gain <= ROUNDED_GAIN else figures.unknown_input_gain,
+        largest_gain([figures]),
         fault.bias,
         fault.detection_delay,
         fault.smallest_found,
