@@ -180,6 +180,20 @@ def test_sensors_of_linear_designs_are_ranked_by_their_dynamics(linear):
     assert "sensor y1" not in event.ties
 
 
+@pytest.mark.long
+def test_sensors_of_designs_that_expect_a_course_of_the_faults_are_ranked_too(linear):
+    """A PI observer follows a fault that stays, and an offset of a sensor until its estimates are moved."""
+    filter_of_plant, _, log = linear
+    design = obsynth.ui_pi_observer(filter_of_plant.plant)
+    learned = obsynth.learn_thresholds(design, [log(1), log(2)])
+    for sensor, name in enumerate(design.plant.output_names):
+        event = event_of(design, learned, log(9, sensor=sensor, size=0.5))
+        assert f"sensor {name}" in (event.fault, *event.ties)
+    assert event_of(design, learned, log(9, leak=0.3)).fault == "leak"
+    assert event_of(design, learned, log(9, sensor=1, size=0.5)).fault == "sensor y2"
+    assert event_of(design, learned, log(9, sensor=1, size=0.5), sensor_faults=False).fault == "leak"
+
+
 JUMPS = tuple(Hypothesis(name, name.startswith("sensor"), False) for name in ("leak", "worn", "sensor y"))
 
 

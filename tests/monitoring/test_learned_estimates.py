@@ -450,3 +450,26 @@ def test_sensors_slower_than_the_rows_leave_the_others_to_be_watched(sensors: st
     assert run.events
     assert run.events[0].fault == "f"
     assert 300 <= run.events[0].first_row <= 310
+
+
+def test_what_other_sensors_say_of_a_fault_is_not_judged_by_the_scale_of_the_one_that_is_missing() -> None:
+    """The second gauge has a tenth of the noise that the design states, and levels of changes are as low: samples
+    without it, of which none was learned from, alarmed in one row each."""
+    design = doubly_seen()
+
+    def seen(rows: int, seed: int, begin: int | None = None) -> pd.DataFrame:
+        data, rng = log(rows, seed), np.random.default_rng(seed)
+        lost = np.where(np.arange(rows) < (rows if begin is None else begin), 1.0, 0.7)
+        level = lfilter([1.0], [1.0, -1.0 / (1.0 + DT)], DT * 10.0 * lost * data["u"] / (1.0 + DT))
+        return data.assign(y=level + 0.1 * rng.standard_normal(rows), slow=level + 0.001 * rng.standard_normal(rows))
+
+    found = obsynth.learn_thresholds(design, [seen(500, seed) for seed in (1, 2, 3)], false_alarms="1 per 500 rows")
+    monitor = obsynth.online_monitor(design, "learned", normal=found)
+    blank, without = seen(500, 4), seen(500, 5, 300)
+    blank.loc[np.arange(60, 500, 11), "slow"] = np.nan
+    without.loc[250:, "slow"] = np.nan
+    assert len(obsynth.run_on_data(design, blank, monitor=monitor).events) <= 2
+    # A sensor that is gone for good hides no fault that the other one shows.
+    run = obsynth.run_on_data(design, without, monitor=monitor)
+    assert [event.fault for event in run.events if event.first_row > 300]
+    assert min(event.first_row for event in run.events) > 300

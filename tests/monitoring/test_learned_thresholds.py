@@ -419,6 +419,25 @@ def test_rows_that_are_predicted_from_before_the_first_one_are_no_evidence(warm_
     assert statistics[50] > 1.0
 
 
+def test_rows_that_are_predicted_from_a_warm_up_are_no_evidence_where_a_column_is_predicted_closely() -> None:
+    """What is left of the start was not learned from: a UI-PI observer of a two-mass drive was in alarm for 14 to 38 of
+    the first 210 rows of healthy logs, at the ages of its first decided row, with thresholds of three such logs."""
+    found = learned()
+    count, channels = len(watched_names(heated())), found.statistics.model.channels
+    past = np.array([0.5 * np.eye(channels), 0.499 * np.eye(channels), np.zeros((channels, channels))])
+    model = Autoregression(np.zeros(channels), past, 1e5 * np.eye(channels))
+    assert model.rests_on_the_past
+    rule = LearnedRule(replace(found, statistics=replace(found.statistics, model=model)), watched_names(heated()))
+    nothing, state, statistics = np.zeros(0), rule.init(), []
+    for k in range(260):
+        observation = LinearSample(np.full(count, 5.0 * (-0.4) ** k if k < 5 else float(k == 250)), nothing, nothing, 0)
+        state, judged = rule.step(state, Sample(k * DT, nothing, nothing, observation, deciding=k >= 5))
+        statistics.append(judged.statistic)
+    assert np.isnan(statistics[:5]).all()
+    assert max(statistics[5:250]) < 1e-6
+    assert statistics[250] > 1.0
+
+
 @pytest.mark.long
 def test_too_few_rows_are_told() -> None:
     short = obsynth.learn_thresholds(heated(), log(400, 0), false_alarms="1 per day")

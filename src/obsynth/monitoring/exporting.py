@@ -22,6 +22,7 @@ from obsynth.monitoring.thresholds.learned_rule import (
     ROOM_OF_START,
     LearnedRule,
     follow_shares,
+    shares_of_partial_scores,
 )
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
@@ -200,6 +201,7 @@ class LearnedMonitorInC:
             **self._step_responses(),
             "monitor_effects": learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age),
             "monitor_bands": (np.zeros(len(learned.statistics.estimates)) if bands is None else bands)[None],
+            "monitor_partly_measured": shares_of_partial_scores(learned)[None],
             "monitor_centres": learned.centres[None],
             "monitor_scales": learned.scales[None],
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,

@@ -330,8 +330,9 @@ static int inverted(REAL *a)
     return is_finite;
 }
 
-/* What a sample says of the faults: what it added to the information on them, and the score of a change. */
-static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
+/* What a sample says of the faults: what it added to the information on them, and the score of a change, which counts
+ * less of a sample without all outputs. */
+static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *covariance, int has_all)
 {
     REAL own[MONITOR_WIDTH * MONITOR_WIDTH];
     REAL prior[MONITOR_WIDTH * MONITOR_WIDTH];
@@ -367,6 +368,7 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
             row[i] += own[at] * (theta[j] - m->centres[j]);
             row[i] -= prior[at] * (m->before[j] - m->centres[j]);
         }
+        row[i] *= has_all ? 1 : monitor_partly_measured[0][i];
         row[MONITOR_WIDTH + i] = own[i * MONITOR_WIDTH + i] - prior[i * MONITOR_WIDTH + i];
     }
     for (i = 0; i < MONITOR_ESTIMATES; i++) {
@@ -531,6 +533,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     int which = 0;
     int is_said = !is_gap;
     int is_whole = deciding;
+    int has_all = 1;
     int is_partly = 0;
     int seen[CHANNELS];
     REAL most = (REAL)HUGE_VAL;
@@ -541,6 +544,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     }
     m->taken += m->taken <= MONITOR_SETTLING;
     m->decided = m->decided || deciding;
+    /* Rows that are predicted from those of a warm-up were not learned from. */
+    if (MONITOR_RESTS && innovation < 0 && !m->decided) {
+        m->to_wait = ORDER + 1;
+    }
     for (i = 0; i < CHANNELS; i++) {
         x[i] = shown[monitor_places[i]];
         is_said = is_said && isfinite(x[i]);
@@ -548,8 +555,9 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         is_partly = is_partly || seen[i];
     }
     for (i = 0; i < MONITOR_WATCHED; i++) {
-        is_whole = is_whole && (isfinite(shown[i]) || monitor_seldom[i]);
+        has_all = has_all && (isfinite(shown[i]) || monitor_seldom[i]);
     }
+    is_whole = is_whole && has_all;
     is_partly = is_partly && deciding && !is_whole && innovation >= 0;
     for (i = 0; i < CHANNELS; i++) {
         kept[i] = x[i];
@@ -578,7 +586,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         m->to_wait = ORDER;
     }
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
-    monitor_score(m, shown, covariance);
+    monitor_score(m, shown, covariance, has_all);
     if (deciding && m->taken > MONITOR_SETTLING) {
         monitor_centre(m, shown, covariance);
     }

@@ -26,7 +26,6 @@ from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
 from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR, EarlierChanges
 from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of, ranked
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
-from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_profiles
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -349,7 +348,7 @@ def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffec
     effects: FaultEffects | None = None
     if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
         effects = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
-    elif isinstance(observer, LinearObserver) and not expects_fault_profiles(design):
+    elif isinstance(observer, LinearObserver):
         effects = LinearEffects(design, learned)
     return None if effects is None or effects.numbers > MOST_NUMBERS else effects
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
@@ -89,6 +90,19 @@ class _Row(NamedTuple):
     varying: bool  # whether the gain follows what is measured
 
 
+def shares_of_partial_scores(learned: LearnedThresholds) -> FloatArray:
+    """Return by which share the score of each fault ``(nf,)`` counts of a sample without all outputs.
+
+    Where covariances are too large for the rows that were learned from, scores of whole samples and the levels of
+    changes are smaller than information says, but not the scores of other outputs alone."""
+    faults = len(learned.statistics.estimates)
+    if not faults:
+        return NOTHING
+    levels = learned.levels[-2 * faults : -faults]
+    usual = chi2.isf(1.0 / (learned.every * len(learned.levels) * len(AGES)), 1)
+    return np.asarray(np.minimum(np.sqrt(levels / usual), 1.0))
+
+
 def follow_shares(memory: float) -> tuple[float, float]:
     """Return by which share of a row the offset of residuals follows it, and by which while there is an alarm."""
     return (1.0 / memory, 1.0 / (SLOWER_IN_ALARM * memory)) if memory else (0.0, 0.0)
@@ -107,9 +121,12 @@ class LearnedRule(Rule):
     ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
     likely.
 
+    A sample that lacks outputs says of a fault what the others do, at a scale that was not learned: what the level of
+    a change is below that of scores as large as their information says is taken from it.
+
     Of a linear observer with a column that is predicted closely, as an estimate that follows from the residuals before,
-    rows that are predicted from a missing one, or from rows before the first one, add no evidence, as none of these was
-    learned from.
+    rows that are predicted from a missing one, from one of the warm-up, or from rows before the first one, add no
+    evidence, as none of these was learned from.
 
     With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
     exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
@@ -143,6 +160,7 @@ class LearnedRule(Rule):
         offsets = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
         self._effects = offsets.ravel()
         self._swinging = len(FORGETTING) * self._model.channels + len(templates)
+        self._partly_measured = shares_of_partial_scores(learned)
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
         self._ranges = learned.ranges
@@ -191,15 +209,22 @@ class LearnedRule(Rule):
         if follows_nothing and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
             state = state._replace(waiting=self._model.order)
         state = state._replace(last=sample.time, taken=state.taken + 1, decided=int(state.decided or sample.deciding))
-        state = self._scored(state, sample.observation, missing)
+        if not state.decided and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
+            state = state._replace(waiting=self._model.order + 1)
+        values = watched_values(sample.residuals, sample.observation)
+        state = self._scored(state, sample.observation, missing, whole=self._is_whole(values))
         if sample.deciding and state.taken > self.learned.settling:
             state = self._centred(state, sample.observation)
         return state._replace(raised=self._raised(state.raised, sample, missing))
 
+    def _is_whole(self, values: FloatArray | None) -> bool:
+        """Return whether all that may be watched is there, but what most rows lack."""
+        return values is not None and bool(np.isfinite(values[self._usual]).all())
+
     def _row(self, state: LearnedState, sample: Sample) -> _Row:
         """Return what a sample says, and how far it counts."""
         values = watched_values(sample.residuals, sample.observation)
-        complete = values is not None and sample.deciding and bool(np.isfinite(values[self._usual]).all())
+        complete = sample.deciding and self._is_whole(values)
         evidence = None
         if values is not None and sample.deciding:
             evidence = self._completed(state, values, complete=complete)
@@ -300,12 +325,13 @@ class LearnedRule(Rule):
             return 1.0
         return self._ranges.factors(state.raised.max(axis=0, initial=1.0), len(self.learned.levels))
 
-    def _scored(self, state: LearnedState, observation: Any, missing: int) -> LearnedState:
-        """Return the state with what a sample says of the faults."""
+    def _scored(self, state: LearnedState, observation: Any, missing: int, *, whole: bool) -> LearnedState:
+        """Return the state with what a sample says of the faults, ``whole``: with all usual outputs."""
         if self._walk is None or not isinstance(observation, Evidence):
             return state
         before, scores = sample_score(state.before, observation, self._walk, missing + 1)
-        row = np.concatenate([scores.away(state.centres), np.diag(scores.information)])
+        away = scores.away(state.centres) * (1.0 if whole else self._partly_measured)
+        row = np.concatenate([away, np.diag(scores.information)])
         gone = min(missing, max(AGES))
         newest_scores = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
         return state._replace(before=before, scores=newest_scores)
