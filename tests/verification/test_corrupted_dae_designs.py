@@ -97,6 +97,7 @@ RENAMED_UNITS = {name.replace("temperature", "heat"): unit for name, unit in exc
 #: Corruption -> what must fail, at least.
 TABLE: dict[str, tuple[Corruption, set[str]]] = {
     "a listed gain": (lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), {"gains"}),
+    "a gain that is left out": (lambda d: d.replace(gains={"Upsilon": d.gains["Upsilon"]}), {"gains"}),
     "claim: a gain": (claim("gamma", 1e-9), {"claims covered"}),
     "another model": (shipped(model=exchanger(equations=OTHER)), {FITS, CLAIMS}),
     "another name": (shipped(model=exchanger(outputs=RENAMED, units=RENAMED_UNITS)), {FITS}),

@@ -125,6 +125,7 @@ TABLE = {
     "T0 sees a dynamic row": ("both", matrix("T0", at(0, 0, add=1.0)), [T0E, A_ROW, U_ROW, D_ROW, MODELS, "gains"]),
     "a listed gain": ("both", lambda d: d.replace(gains={**d.gains, "T": 1.001 * d.gains["T"]}), ["gains"]),
     "a gain that is none of its own": ("both", lambda d: d.replace(gains={**d.gains, "K": np.eye(2)}), ["gains"]),
+    "a gain that is left out": ("both", lambda d: d.replace(gains={"T": d.gains["T"]}), ["gains"]),
     "no proof of stability": ("both", matrix("stability", lambda q: np.diag(-np.diag(q) + 1e3)), [STABILITY]),
     "order": ("both", claim(order=1.0), [ORDER]),
     "order, more than there are": ("both", claim(order=40.0), [ORDER]),

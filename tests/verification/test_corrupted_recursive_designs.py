@@ -168,6 +168,7 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
         "constant", with_gains(lambda L, K: (0.0 * L, 0.0 * K)), {"gains", STEADY_UNBIASED, STEADY_DEFINITE},
     ),
     "a listed gain": ("innovation", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), {"gains"}),
+    "a gain that is left out": ("innovation", lambda d: d.replace(gains={"L": d.gains["L"]}), {"gains"}),
     "claim: a gain": ("innovation", claim("gamma", 1e-9), {"claims covered"}),
     "claim: not a number": ("innovation", claim("contraction", np.nan), {CLAIMS}),
     "claim: missing": (

@@ -307,6 +307,9 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     # The letters, and the last digits, and what nothing checks.
     "a listed gain": ("paper", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), ("gains",)),
     "an unknown letter": ("paper", lambda d: d.replace(gains={**d.gains, "Z": np.eye(2)}), ("gains",)),
+    "a letter that is left out": (
+        "paper", lambda d: d.replace(gains={name: K for name, K in d.gains.items() if name != "K_a"}), ("gains",)
+    ),
     "By in the last digits": (
         "paper", lambda d: d.replace(observer=dataclasses.replace(d.observer, By=d.observer.By * (1.0 + 3e-12))),
         ("stored numbers: states",)),

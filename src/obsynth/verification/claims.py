@@ -257,8 +257,10 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
 def listed_gains(
     design: ObserverDesign, recomputed: Mapping[str, FloatArray], *, tolerance: float = EQUALITY_TOLERANCE
 ) -> Check:
-    """Return the row on the listed gains, which run; of a recursion they are those of the last step looked at."""
-    wrong = [letter for letter in design.gains if letter not in recomputed]
+    """Return the row on the listed gains, which run; of a recursion they are those of the last step looked at.
+
+    A gain set lists all of them or none."""
+    wrong = sorted(design.gains.keys() ^ recomputed.keys()) if design.gains else []
     gap = 0.0
     for letter, matrix in recomputed.items():
         listed = design.gains.get(letter, matrix)

@@ -1,4 +1,4 @@
-"""Recomputed numbers of a shipped observer: stability, poles, rates, digits, noise; and its listed gains."""
+"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise; and the letters of its gains."""
 
 from __future__ import annotations
 
@@ -36,6 +36,9 @@ from obsynth.verification.inequalities import decay_row, stability_row
 SPECTRUM_TOLERANCE = 1e-4
 
 POLE_CLAIM_TOLERANCE = 1e-4
+
+#: Letters that only an observer with a fault estimate apart from its state has: all of them, or none.
+LETTERS_OF_PARTS = frozenset({"U", "D", "K", "F", "Hhat"})
 
 #: Poles that a row lists.
 LISTED_POLES = 8
@@ -145,16 +148,18 @@ def gain_rows(
     """Yield the row on the listed gains; nothing where none are listed, as the realisation stands for itself."""
     if not gains:
         return
-    residuals, unknown = [], sorted(set(gains) - set(_shapes(plant, observer, model)))
-    for letter, shape in _shapes(plant, observer, model).items():
+    shapes, residuals = _shapes(plant, observer, model), []
+    expected = set(shapes) if set(gains) & LETTERS_OF_PARTS else set(shapes) - LETTERS_OF_PARTS
+    wrong = sorted(set(gains) ^ expected)
+    for letter, shape in shapes.items():
         if letter in gains and (gains[letter].shape != shape or not np.all(np.isfinite(gains[letter]))):
-            unknown.append(letter)
-    if not unknown:
+            wrong.append(letter)
+    if not wrong:
         residuals = list(_residuals(gains, plant, observer, model, tracking))
-    missed = worst(residuals) if residuals else Residual(1.0 if unknown else 0.0, 1.0)
-    claim = "the letters are known, and those of the realisation, the fault model and the certificate"
+    missed = worst(residuals) if residuals else Residual(1.0 if wrong else 0.0, 1.0)
+    claim = "all letters are listed, and are those of the realisation, the fault model and the certificate"
     row = equality("gains", claim, missed, "Share Pasand, eqs. (4), (12), (19), (20)", bound=tolerance)
-    yield row if not unknown else Check(**{**row.__dict__, "detail": f"wrong: {', '.join(unknown)}"})
+    yield row if not wrong else Check(**{**row.__dict__, "detail": f"wrong: {', '.join(wrong)}"})
 
 
 def _shapes(plant: DescriptorSystem, observer: LinearObserver, model: Exosystem) -> dict[str, tuple[int, int]]:
