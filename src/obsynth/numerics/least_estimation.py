@@ -1,10 +1,10 @@
-"""The least gain from w to ``e0 - Z r`` over all causal Z, with a filter that reaches it.
+"""H-infinity filtering: the least gain from w to ``e0 - Z r`` over all causal Z, with a filter that attains it.
 
 At level g the filtering Riccati equation with ``[C; L]``, ``[D; D1]`` and weight ``diag(0, -g^2)`` has a stabilising
-solution of the right signs exactly when a causal filter of gain below g exists (Hassibi, Sayed, Kailath,
+solution of the right signs if and only if a causal filter with a gain below g exists (Hassibi, Sayed, Kailath,
 *Indefinite-Quadratic Estimation and Control*, 1999, chapter 4).  With P and the full gain K of that solution,
-``Phi = (A - K [C; L])'`` is how the worst noise of the past decays backwards: its eigenvalues are what
-`obsynth.verification.invisible_faults` proves a lower bound with, for every causal filter, linear or not.
+``Phi = (A - K [C; L])'`` describes how the worst noise decays backwards in time.  From its eigenvalues
+`obsynth.verification.invisible_faults` proves a lower bound for every causal filter, linear or not.
 """
 
 from __future__ import annotations
@@ -30,57 +30,58 @@ from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import reachable_basis
 
-#: Least singular value of [A - z I; C] at a mode z, beside the norm of both, above which the outputs show that mode.
+#: A mode z is observable if the least singular value of [A - z I; C] exceeds this share of the norm of [A; C].
 SHOWN_SHARE = 1e-6
 
-#: Modes beyond are one over rounding: those of a problem that has lost its digits.
+#: Larger modes are results of rounding in a problem that has lost its digits.
 FARTHEST_MODE = 1e12
 
-#: Why there is no filter.
+#: Message for plants without a filter.
 UNSTABLE_ZERO = (
     "The transfer from the faults to the outputs has a zero that is not strictly stable: no stable filter has this "
     "fault map."
 )
-#: The bisection of the level ends at this share.
+#: Relative width of the bracket of levels at which the search ends, and most levels that it tries.
 LEVEL_SHARE = 1e-8
 MOST_LEVELS = 60
-#: The next level is this share of what two estimates of the least one differ by above the better estimate, and each
-#: time that one fails so many times farther, until after so many failures the bracket is halved.
+#: The next level lies above the better estimate of the least one by this share of the difference of two estimates.
+#: Each failure enlarges the share by CAUTION; after MOST_FAILURES the bracket is halved.
 ESTIMATE_SHARE, CAUTION, MOST_FAILURES = 0.2, 10.0, 3
-#: Extra noise, of the size of the matrices, for problems in which some output is measured without noise.
+#: Noise that is added to the outputs, relative to the size of the matrices, if some output has no noise; tried in turn.
 ADDED_NOISES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
-#: A Kalman filter whose errors last longer than this is taken as not stable.
+#: A Kalman filter with a larger spectral radius counts as unstable.
 STABLE_RADIUS = 1.0 - 1e-6
-#: An innovation with eigenvalues further apart is singular.
+#: An innovation covariance is singular if the ratio of its least to its largest eigenvalue is at most this.
 SINGULAR_INNOVATION = 1e-11
-#: How much the sizes of what is estimated count beside those of what is measured.
+#: Weight of the sizes of estimated signals relative to measured ones in the size of a problem.
 WANTED_SHARE = 1e-3
-#: Entries below this share of the largest are the rounding of rounding: SciPy balances the pencil of the Riccati
-#: equation, and one of 1e-53 takes the units of states so far apart that no digit of the solution is left.
+#: Entries below this share of the largest one count as zero.  SciPy balances the pencil of the Riccati equation, and an
+#: entry of 1e-53 would give states so different units that no digit of the solution is left.
 NO_ENTRY = float(np.finfo(float).eps) ** 2
-#: How negative a Riccati solution may be, of its size, by rounding.
+#: A Riccati solution may have negative eigenvalues up to this share of its size, by rounding.
 NEGATIVE_SHARE = 1e-7
-#: Levels above the least one whose worst noise is returned: nearer ones are closer bounds, until rounding spoils them.
+#: Multiples of the least level for which the worst noise is returned: nearer ones give closer bounds, unless rounding
+#: spoils them.
 WORST_LEVELS = (1.0 + 1e-6, 1.0 + 1e-5, 1.0001, 1.001, 1.01)
-#: What a bound is lowered by, of itself, for the rounding of its sums.
+#: A lower bound is reduced by this share for the rounding of its sums.
 BOUND_ROUNDING = 1e-9
-#: A gain below this share of the problem's own sizes is zero but for rounding.
+#: A gain below this share of the problem's size is zero up to rounding.
 ZERO_SHARE = 1e-9
-#: Samples, and inputs in all, of the finite records that are searched for what r does not show.
+#: Most samples, and most inputs in total, of finite records that are searched for signals which r does not show.
 LONGEST_FROM_REST, MOST_INPUTS_FROM_REST = 60, 360
-#: A kernel counts where the other singular values are above this share.
+#: A null space counts if all other singular values exceed this share.
 CLEAR_KERNEL = 1e-5
-#: Outputs that show w by less than this share of the problem's sizes do not show it.
+#: The outputs do not show w if its effect on them is below this share of the problem's size.
 BLIND_SHARE = 1e-10
-#: They are looked at at two angles, neither a simple part of the circle: a response that vanishes at both vanishes.
+#: Two generic angles at which that effect is evaluated: a response that vanishes at both vanishes everywhere.
 BLIND_ANGLES = np.array([0.7, 2.1])
-#: Directions that w reaches by less than this share are not reached.
+#: Directions that w drives by less than this share count as unreachable.
 REACHED_BY_NOISE = 1e-9
-#: A level counts as attained where the norm of its filter is at most this share above it.
+#: A filter attains a level if its norm exceeds the level by at most this share.
 NORM_ABOVE_LEVEL = 1e-6
-#: Least angle of the grid, and angles beside the modes that are looked at.
+#: Least angle of the frequency grid, and offsets of additional angles near modes.
 LEAST_ANGLE, NEAR_MODES = 1e-6, np.array([0.0, 1e-4, -1e-4, 1e-2, -1e-2])
-#: Angles on the half circle at which a response is looked at first.
+#: Number of angles of the grid on the half circle.
 GRID = 1500
 
 
@@ -88,8 +89,8 @@ GRID = 1500
 class LeastEstimation:
     """The filter ``i = r - C chi``, ``chi+ = A chi + K i``, ``ehat = L chi + Z0 i``, and its recomputed norm.
 
-    ``limit`` is the least gain with unlimited delay, at the angle ``limit_angle``; ``added_noise`` is above zero where
-    an output is measured without noise; ``decays`` are the eigenvalues of the worst noise, level by level.
+    ``limit`` is the least gain with unlimited delay, at the angle ``limit_angle``.  ``added_noise`` is positive where an
+    output has no noise.  ``decays`` are the eigenvalues of the worst noise, for each level.
     """
 
     K: FloatArray
@@ -102,7 +103,7 @@ class LeastEstimation:
 
 
 class Whitened(NamedTuple):
-    """A problem whose r is the innovation, without errors that w cannot reach, and the way back to the given one."""
+    """A problem in terms of the innovation, without errors that w cannot reach, and its relation to the given one."""
 
     problem: EstimationProblem
     plain: EstimationProblem  # without added noise
@@ -112,7 +113,7 @@ class Whitened(NamedTuple):
     noise: float
 
     def restored(self, original: EstimationProblem, K: FloatArray, Z0: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return gains on the given problem's r of gains on the innovation."""
+        """Return gains for r of the given problem from gains for the innovation."""
         if self.factor is None:
             return np.zeros((len(original.A), len(original.C))), np.zeros((len(original.L), len(original.C)))
         return self.K + self.basis @ K @ self.factor, Z0 @ self.factor
@@ -123,7 +124,8 @@ def least_estimation(
 ) -> LeastEstimation:
     """Return the filter of least gain (``"hinf"``) or of least mean square (``"h2"``, the root of the trace).
 
-    ``noises`` are added, the first that gives a filter.  Raise `PreconditionError` where no filter is stable.
+    The first of ``noises`` with which a filter exists is added to the outputs.  `PreconditionError` is raised where no
+    filter is stable.
     """
     white = whitened(problem, noises)
     core = white.problem
@@ -146,13 +148,13 @@ def least_estimation(
 
 
 def achieved(white: Whitened, K: FloatArray, Z0: FloatArray, norm: str) -> float:
-    """Return the norm (``"hinf"``, ``"h2"``) from w to the error with gains on the innovation."""
+    """Return the norm (``"hinf"`` or ``"h2"``) from w to the error with gains for the innovation."""
     closed = _error_system(white.plain, K, Z0)
     return _norm(closed) if norm == "hinf" else _deviation(closed)
 
 
 def require_stable_filter(problem: EstimationProblem) -> None:
-    """Raise `PreconditionError` where no filter is stable: cheaper than the least one."""
+    """Raise `PreconditionError` where no filter is stable, without computing the least gain."""
     whitened(problem)
 
 
@@ -184,14 +186,15 @@ def _size(problem: EstimationProblem) -> float:
 
     measured_size = size(problem.C) * size(problem.B) + size(problem.D)
     estimated_size = size(problem.L) * size(problem.B) + size(problem.D1)
-    # Where no noise enters at all, what is added is a share of what states of size one show.
+    # Without any noise, the size is that of the outputs for states of size one.
     return max(measured_size, WANTED_SHARE * estimated_size) or max(size(problem.C), SMALLEST)
 
 
 def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES) -> Whitened:
-    """Return the problem with an innovation for r, without errors that w cannot reach.
+    """Return the problem in terms of the innovation, without errors that w cannot reach.
 
-    Where an output has no noise, some is added: the filter is then one for the plant as given, and so is its gain.
+    Where an output has no noise, noise is added.  The filter is nevertheless one for the given plant, with the gain
+    that it has there.
     """
     n, rows, size = len(problem.A), len(problem.C), _size(problem)
     stable = bool(np.max(np.abs(np.linalg.eigvals(problem.A)), initial=0.0) < STABLE_RADIUS)
@@ -240,9 +243,9 @@ def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES)
 
 
 def _shows_lasting_modes(problem: EstimationProblem) -> bool:
-    """Return whether the outputs clearly show each mode on or outside the unit circle, so that (A, C) is detectable.
+    """Whether each mode on or outside the unit circle is clearly observable, so that (A, C) is detectable.
 
-    Those so far outside that double precision has no digits of them do not count.
+    Modes beyond double precision do not count.
     """
     n, whole = len(problem.A), np.vstack([problem.A, problem.C])
     lasting = [value for value in np.linalg.eigvals(problem.A) if STABLE_RADIUS <= abs(value) < FARTHEST_MODE]
@@ -252,10 +255,10 @@ def _shows_lasting_modes(problem: EstimationProblem) -> bool:
 
 
 def _noisy(problem: EstimationProblem, noise: float) -> tuple[FloatArray, FloatArray]:
-    """Return B and D with noise of some size on each output; of a problem without any noise on each state as well.
+    """Return B and D with additional noise on each output, and for a problem without any noise also on each state.
 
-    Its lasting modes are then forgotten as fast as they are seen.  Where a problem has noise, and none on lasting
-    modes, it is for the caller to drive these: in its own plant, whose claims stay those of the plant as it is.
+    Noise on the states makes the filter forget errors of undamped modes.  If a problem has noise, but none on undamped
+    modes, the caller has to add it to its plant.
     """
     B, D = problem.B, problem.D
     if not noise:
@@ -269,7 +272,7 @@ def _noisy(problem: EstimationProblem, noise: float) -> tuple[FloatArray, FloatA
 
 
 def _central(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return K and Z0 of the filter of a Riccati solution."""
+    """Return the gains K and Z0 of the filter that belongs to a Riccati solution."""
     A, B, C, D, L, D1 = problem.A, problem.B, problem.C, problem.D, problem.L, problem.D1
     if not len(C):
         return np.zeros((len(A), 0)), np.zeros((len(L), 0))
@@ -301,8 +304,10 @@ def _deviation(system: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) ->
 
 
 def _at_level(problem: EstimationProblem, level: float) -> tuple[FloatArray, float] | None:
-    """Return the stabilising solution of the filtering equation at a level, or ``None`` where no filter is below it,
-    and by how much what must be negative is so, as a share of the squared level."""
+    """Return the stabilising solution of the filtering equation at a level, and its margin; ``None`` without a filter.
+
+    The margin is that of the block that has to be negative, as a share of the squared level.
+    """
     rows = len(problem.C)
     CL, DD = np.vstack([problem.C, problem.L]), np.vstack([problem.D, problem.D1])
     weight = DD @ DD.T

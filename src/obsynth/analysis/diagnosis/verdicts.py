@@ -17,24 +17,24 @@ from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.suggestions import there_are
 
-#: With more faults only residuals that are blind to one fault, or see one, are looked for unless all are asked for.
+#: With more faults only residuals that see all faults, all but one, or a single one are searched by default.
 MOST_PATTERN_FAULTS = 6
 
 
 @dataclass(frozen=True)
 class StructuredResidual:
-    """A residual that can be had: it sees some faults, and neither the others nor any unknown input.
+    """A residual that exists: some faults affect it, and the other faults and all unknown inputs do not.
 
     Parameters
     ----------
     sees : tuple of str
-        Faults that leave a trace in it.
+        Faults that affect the residual.
     blind_to : tuple of str
-        The others.
+        The other faults, which do not.
     at_rest : tuple of str
-        Those of `sees` whose constant values it keeps seeing.
+        Faults in `sees` whose constant values affect the residual in the steady state.
     order : int or None
-        Least order of a filter with one residual that sees them all; ``None`` where it is beyond what is computed.
+        Least order of a filter with one residual that all faults of `sees` affect; ``None`` where it was not computed.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class StructuredResidual:
 
 
 def residual_bank(faults: DecoupledFaults, whole_bank: bool = False) -> tuple[StructuredResidual, ...]:
-    """Return the structured residuals that exist, those that see least first: all, or those of `_sets`."""
+    """Return the structured residuals that exist, those that see fewest faults first."""
     residuals, plant = [], faults.source
     for removed in _sets(plant.nf, whole_bank):
         remaining = [i for i in range(plant.nf) if i not in removed]
@@ -70,7 +70,7 @@ def residual_bank(faults: DecoupledFaults, whole_bank: bool = False) -> tuple[St
 
 
 def _sets(count: int, whole_bank: bool) -> Iterator[Sequence[int]]:
-    """Yield the sets of faults to be blind to."""
+    """Yield the sets of faults that residuals are decoupled from: all sets, or none, one, and all but one of many."""
     if whole_bank or count <= MOST_PATTERN_FAULTS:
         for size in range(count):
             yield from combinations(range(count), size)
@@ -83,49 +83,51 @@ def _sets(count: int, whole_bank: bool) -> Iterator[Sequence[int]]:
 
 @dataclass(frozen=True, eq=False)
 class FaultDiagnosis:
-    """What a plant's outputs tell about one fault, whatever the unknown inputs and the initial state are.
+    """Diagnosability of one fault from a plant's outputs, for arbitrary unknown inputs and initial states.
 
     Parameters
     ----------
     name : str
-        The fault.
+        Name of the fault.
     detectable : bool
-        Whether it leaves any trace.
+        Whether the fault affects a residual.
     detectable_at_rest : bool
-        Whether a constant fault leaves a constant trace.
+        Whether a constant fault affects a residual in the steady state.
     detectable_at : dict of float to bool
-        The same for sinusoids, by frequency in rad/s.
+        The same for sinusoidal faults, by frequency in rad/s.
     estimable : bool
-        Whether its value can be estimated, whatever its time course and that of all other faults.
+        Whether the fault can be estimated for arbitrary profiles of all faults.
     step_estimable : bool
-        Whether it can if it is a step (the other faults are arbitrary).
+        Whether the fault can be estimated if it is a step (the other faults are arbitrary).
     model_estimable : bool
-        Whether it can if it follows the fault model that was asked about.
+        Whether the fault can be estimated if it follows the given fault model.
     order : int or None
-        Derivatives of the outputs (samples of delay, for sampled plants) that an estimate of an arbitrary time course
-        needs; a step needs none.  ``None`` where it cannot be distinguished from the rest.
+        Derivatives of the outputs (samples of delay, for sampled plants) that the estimate of an arbitrary profile
+        needs; a step needs none.  ``None`` where the fault is not isolable from the others.
     residual_order : int or None
-        Least order of a filter with one residual that shows it, blind to the unknown inputs.
+        Least order of a filter with one residual that the fault affects, decoupled from the unknown inputs.
     filter_order : int
-        Order of the plant without unknown inputs and other faults; a filter that estimates the fault has one state
-        more for each of its model.
+        Order of the plant without unknown inputs and other faults.  A filter that estimates the fault has one more
+        state for each state of its model.
     zeros : ComplexArray
-        ``(k,)``, 1/s (dimensionless for sampled plants): where it cannot be distinguished from the unknown inputs and
-        the other faults.
+        Points ``(k,)`` of the complex plane, in 1/s (dimensionless for sampled plants), at which the fault cannot be
+        distinguished from the unknown inputs and the other faults.
     blocking : ComplexArray
-        Those on or outside the boundary of stability: what forbids an estimate of an arbitrary time course.
+        The zeros on or outside the boundary of stability, which make an estimate of an arbitrary profile impossible.
     sentences : tuple of str
-        What hides it, and what would help.
+        What hides the fault, and which sensors would help.
     exact : bool
-        Whether all this was decided over the rational numbers; orders of larger plants are not.
+        Whether the verdicts were decided in rational arithmetic; orders of larger plants are not.
     gap : float
-        How clear the least clear decision was, kept over dropped; infinite for exact ones.
+        The least ratio of a singular value that counts as nonzero to one that counts as zero, over all decisions;
+        infinite for exact decisions.
     margin : float
-        By how much it has to be larger to be distinguished from all other faults, of any size, than to be seen; as a
-        constant where it can be, else as a sinusoid.  Infinite where it cannot be.
+        Ratio of the fault sizes at which it can be isolated from all other faults, of any size, and at which it is
+        visible at all; for constant faults where these are isolable, else for sinusoids.  Infinite where it is not
+        isolable.
     least_step : float or None
-        In its unit: the step that stands out by three standard deviations of the sensors' noise in the mean of 100
-        samples, whatever the other faults are; ``None`` where no noise is stated on every output.
+        The step, in the fault's unit, with an effect of three standard deviations of sensor noise on the mean of 100
+        samples, whatever the other faults are; ``None`` unless noise is stated on every output.
 
     Examples
     --------
@@ -172,31 +174,31 @@ class FaultDiagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What can be diagnosed on a plant; made by `diagnose`.
+    """Diagnosability of all faults of a plant, as `diagnose` returns it.
 
     Parameters
     ----------
     faults : tuple of FaultDiagnosis
-        In the order of the plant.
+        The faults, in the order of the plant.
     isolable : NDArray
-        ``(nf, nf)`` of bool: entry (i, j) whether fault i can be distinguished from fault j (the diagonal: whether it
-        shows).
+        ``(nf, nf)`` of bool: entry (i, j) says whether fault i can be isolated from fault j; the diagonal says whether
+        it is detectable.
     isolable_at_rest : NDArray
-        ``(nf, nf)`` of bool: the same for constant faults that leave constant traces.
+        ``(nf, nf)`` of bool: the same for constant faults in the steady state.
     bank : tuple of StructuredResidual
-        The structured residuals that exist, those that see least first: all of them up to six faults, or where the
-        whole bank was asked for; else those that see all faults, all but one, or one alone, and a warning says so.
+        The structured residuals that exist, those that see fewest faults first: all of them for up to six faults, or
+        with ``whole_bank``; else those that see all faults, all but one, or a single one, with a warning.
     unknown_inputs : tuple of str
-        What all this is free of.
+        The unknown inputs that all residuals and estimates are decoupled from.
     model : str
-        The fault model that was asked about.
+        The given fault model.
     exact : bool
-        Whether the verdicts were decided over the rational numbers.
+        Whether the verdicts were decided in rational arithmetic.
     warnings : tuple of str
-        Thin decisions and what else a reader should know.
+        Warnings about unclear decisions and unusual plants.
     margins : FloatArray
-        ``(nf, nf)``, dimensionless: entry (i, j) by how much fault i has to be larger to be distinguished from fault j
-        than to be seen; infinite where it cannot be.
+        ``(nf, nf)``, dimensionless: entry (i, j) is the ratio of the sizes at which fault i can be isolated from fault
+        j and at which it is visible; infinite where it is not isolable.
 
     Examples
     --------
@@ -227,7 +229,7 @@ class Diagnosis:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What hides faults and what would help, of all faults."""
+        """The sentences of all faults: what hides them, and which sensors would help."""
         return tuple(sentence for fault in self.faults for sentence in fault.sentences)
 
     def verdict_rows(self) -> tuple[tuple[str, ...], ...]:
@@ -249,8 +251,7 @@ class Diagnosis:
         return (header, *rows)
 
     def isolability_rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', row from column; with the
-        margin where it is worth a word."""
+        """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', with large margins."""
         names = [fault.name for fault in self.faults]
         words = np.where(self.isolable_at_rest, "yes", np.where(self.isolable, "changing", "no")).tolist()
         far = [[NEARLY_ALIKE <= value < np.inf for value in row] for row in self.margins.tolist()]
@@ -260,7 +261,7 @@ class Diagnosis:
         return (("fault", *(f"from {name}" for name in names)), *rows)
 
     def bank_rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the bank of structured residuals as texts: what each sees, at rest, and its least order."""
+        """Return the bank of structured residuals as texts: faults that affect it, those at rest, and least order."""
         rows = [(", ".join(r.sees), ", ".join(r.at_rest) or "none", _count(r.order)) for r in self.bank]
         return (("residual sensitive only to", "in steady state to", "least order"), *rows)
 
@@ -283,7 +284,7 @@ class Diagnosis:
 
     @property
     def heading(self) -> str:
-        """What was asked, in one line."""
+        """One line on the unknown inputs and the arithmetic of the decisions."""
         count = len(self.unknown_inputs)
         named = ", ".join(self.unknown_inputs) if count <= 4 else f"{count} unknown inputs"
         arithmetic = "decided exactly" if self.exact else "decided in floating point"

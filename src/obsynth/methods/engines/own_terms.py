@@ -1,7 +1,7 @@
 """Designs with the user's own constraints, objective, or region of eigenvalues in the inequality.
 
-The methods leave these to the problem as it stands in the paper: solved as it is here, gains taken from it, and the
-realisation and certificate of these gains made as for any others.  `verify` knows nothing of how they were found.
+With such options a method solves the problem of the paper itself.  Its gains get a realisation and a certificate like
+any other gains, and `verify` does not depend on the way they were found.
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem
 from obsynth.results.design import Certificate
 
-#: What is tried by default: an interior-point method, and one of first order that says infeasible where that stalls.
+#: Default solvers: an interior-point method, and a first-order method that can detect infeasibility where it stalls.
 AUTOMATIC = ("CLARABEL", "SCS")
 
-#: What a claimed gain keeps to the true norm, so that the claim has a proof with room for rounding.
+#: A claimed gain exceeds the true norm by this share, so that its proof has room for rounding.
 CLAIM_ROOM = 1e-3
 
-#: Multiples of a rate among which one inside a region is looked for.
+#: Multiples of a default rate that are tried to find a rate inside a region.
 RATE_MULTIPLES = np.logspace(-4, 4, 161)
 
-#: A rate is well inside a region where its margin is above this share of the largest one.
+#: A rate is well inside a region if its margin exceeds this share of the largest margin.
 WELL_INSIDE = 0.5
 
-#: Eigenvalues may be outside a region by this much, by a solver's rounding.
+#: Eigenvalues may lie outside a region by this much, because of a solver's tolerances.
 REGION_TOLERANCE = 1e-6
 
 
 def filter_by_inequality(
     plant: DescriptorSystem, method: FaultEstimationFilter, *, progress: Callable[[str], None]
 ) -> Synthesis:
-    """Return a fault-estimation filter by (45) with what was asked for in it; see `obsynth.fault_estimation_filter`."""
+    """Return a fault-estimation filter from (45) with the user's terms; see `obsynth.fault_estimation_filter`."""
     progress("checking the existence conditions")
     require_all(fault_filter_conditions(plant))
     free = bool(method.asks_for_free_weight)
@@ -89,7 +89,7 @@ def filter_by_inequality(
     progress("solving the matrix inequality")
     runs = [_solved(problem, method)]
     if goal is None and plant.nd:
-        # The bare optimum is badly conditioned: a little more gain buys small matrices.
+        # The optimum itself is badly conditioned: a slightly larger gain allows much smaller matrices.
         least = float(np.sqrt(max(squared.value, 0.0)))
         level = (1.0 + method.gamma_margin) * least if method.gamma is None else method.gamma
         problem = problem.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
@@ -104,7 +104,7 @@ def filter_by_inequality(
 
 
 def _filter_region(method: FaultEstimationFilter, dt: float) -> LMIRegion | None:
-    """Return where the eigenvalues shall be: in the region that is asked for, and fast enough."""
+    """Return the requested region of the eigenvalues, intersected with that of the decay; ``None`` without either."""
     regions = [] if method.region is None else [checked_region(method.region)]
     if method.decay is not None:
         regions.append(disk(0.0, float(np.exp(-method.decay * dt))))
@@ -122,7 +122,7 @@ def _filter_region(method: FaultEstimationFilter, dt: float) -> LMIRegion | None
 def _realised_filter(
     plant: DescriptorSystem, method: FaultEstimationFilter, gains: Mapping[str, FloatArray]
 ) -> Synthesis:
-    """Return the filter of gains, with the gain that it claims, and the mean of its estimates."""
+    """Return the filter with given gains, its claimed gain, and the requested averaging of its estimates."""
     gamma = None
     if plant.nd:
         gamma = (1.0 + CLAIM_ROOM) * error_norm(plant, gains)
@@ -138,7 +138,7 @@ def _realised_filter(
 
 
 def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
-    """Return a PD observer by a theorem with what was asked for in it; see `obsynth.pd_observer`."""
+    """Return a PD observer from Theorem 1 or 2 with the user's terms; see `obsynth.pd_observer`."""
     progress("checking the existence conditions")
     require_all(pd_observer_conditions(plant))
     theorem = filasova_theorem2 if method.theorem == 2 else filasova_theorem1
@@ -164,7 +164,7 @@ def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: C
 
 
 def ui_pi_by_inequality(plant: DescriptorSystem, method: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
-    """Return a UI-PI observer by its inequality with what was asked for in it; see `obsynth.ui_pi_observer`."""
+    """Return a UI-PI observer from its inequality with the user's terms; see `obsynth.ui_pi_observer`."""
     progress("checking the existence conditions")
     model = exosystem(method.fault_model, plant.fault_names, plant.dt)
     known = existence(plant, model)
@@ -199,12 +199,12 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
 
 
 def _own_constraints(method: Any, problem: Conditions) -> dict[str, Any]:
-    """Return the constraints that the user has added, by name."""
+    """Return the user's constraints by name."""
     return {} if method.constraints is None else named_constraints(method.constraints(problem.letters()))
 
 
 def _region_of_poles(method: UiPiObserver, dt: float) -> LMIRegion | None:
-    """Return the region of an observer's poles, by name too: decay, radius, damping."""
+    """Return the requested region of an observer's poles, also from decay, radius and damping."""
     stated = dict(method.region) if isinstance(method.region, Mapping) else {}
     if method.region is not None and not stated:
         return checked_region(method.region)
@@ -222,7 +222,7 @@ def _region_of_poles(method: UiPiObserver, dt: float) -> LMIRegion | None:
 
 
 def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
-    """Raise where the eigenvalues that a solver's gains have are outside the region that was asked for."""
+    """Raise `SolverError` where the eigenvalues with the solver's gains are outside the requested region."""
     if where is None:
         return
     worst = float(np.min(where.margins(np.linalg.eigvals(closed)), initial=np.inf))
@@ -234,7 +234,7 @@ def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
 
 
 def _solved(problem: Conditions, method: Any) -> dict[str, Any]:
-    """Solve a problem by the solver that was asked for, and return the record of the run."""
+    """Solve a problem with the requested solver, or the default ones in turn, and return the record of the run."""
     names = AUTOMATIC if method.solver == AUTOMATIC[0] else (method.solver,)
     for name in (name for name in names if name == names[0] or name in semidefinite_solvers()):
         settings = {**SOLVER_SETTINGS.get(name, {}), **(method.solver_options or {})}
@@ -266,7 +266,7 @@ def _recorded(
     where: LMIRegion | None,
     **resolved: Any,
 ) -> Synthesis:
-    """Return a synthesis from gains as the one that was asked for, with its record."""
+    """Return a synthesis from gains with the options, the record of the solver, and a note on the user's terms."""
     options = {**method.as_plain(), **resolved, "constraints": list(problem.constraints)}
     imposed = f", and every eigenvalue in {where}" if where is not None else ""
     note = f"The inequality was solved as it stands in the paper, with {', '.join(problem.constraints)}{imposed}."
