@@ -89,8 +89,8 @@ GRID = 1500
 class LeastEstimation:
     """The filter ``i = r - C chi``, ``chi+ = A chi + K i``, ``ehat = L chi + Z0 i``, and its recomputed norm.
 
-    ``limit`` is the least gain with unlimited delay, at the angle ``limit_angle``.  ``added_noise`` is positive where an
-    output has no noise.  ``decays`` are the eigenvalues of the worst noise, for each level.
+    ``limit`` is the least gain with unlimited delay, at the angle ``limit_angle``.  ``added_noise`` is positive where
+    an output has no noise.  ``decays`` are the eigenvalues of the worst noise, for each level.
     """
 
     K: FloatArray

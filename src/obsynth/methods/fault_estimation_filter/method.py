@@ -32,7 +32,7 @@ from obsynth.verification.over_region import DECAY_ROW, WITNESSES
 if TYPE_CHECKING:
     from obsynth.verification.requested_limits import Limits
 
-#: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
+#: Smallest allowed `gamma_margin`: closer to the optimum there is no room for a proof.
 LEAST_MARGIN = 1e-2
 
 
@@ -40,42 +40,43 @@ LEAST_MARGIN = 1e-2
 class FaultEstimationFilter(Method):
     r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
 
-    Each fault estimate equals its fault delayed by its detectability index, untouched by the other faults and the
-    state; what is left is the effect of the disturbance, bounded by gamma, and of the initial error, which decays.
+    Each fault estimate equals its fault, delayed by its detectability index, and does not depend on the other faults or
+    the state.  Its error is the effect of the disturbance, bounded by gamma, and of the initial error, which decays.
 
     Parameters
     ----------
     plant : DescriptorSystem, PolytopicSystem or Transformation
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
-        ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.  Over the region of a PolytopicSystem a scheduled filter is
-        designed, with one certificate for every course of the parameters: outputs constant, faults of constant
-        directions (or, between two vertices, turning ones) that are seen after one sample; options gamma, gamma_margin,
-        decay, solver and solver_options.
+        ``D, Df, Dd`` and noise ``Bw, Dw`` are allowed.  For a PolytopicSystem a scheduled filter is designed, with one
+        certificate for all parameter trajectories.  Its outputs have to be constant, and its faults have to show after
+        one sample, in constant directions or, with two vertices, in changing ones.  Options are then gamma,
+        gamma_margin, decay, solver and solver_options.
     gamma : float, optional, dimensionless
-        Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one; where
-        the plant states noise, not less than the gain of the Kalman filter that takes d as unit white noise.
+        Required bound on the l2 gain from d to the fault error.  By default ``1 + gamma_margin`` times the least one,
+        and, if the plant states noise, at least the gain of the Kalman filter for d as unit white noise.
     gamma_search : {"direct", "bisection"}, optional
-        How the least gain is found: one minimisation, or the paper's Algorithm 1 made to end.
+        Search for the least gain: by one minimisation, or by the paper's Algorithm 1 with a stopping rule.
     gamma_margin : float, optional
-        Relative distance to the least gain that buys small gains, or little noise where the plant states noise; the
-        bare optimum is badly conditioned.
+        Relative distance to the least gain.  It allows small gains, or little noise if the plant states noise; the
+        optimum itself is badly conditioned.
     weight : {"paper", "free"} or array_like, optional
-        Residual weight W: ``"paper"`` is W = Upsilon^+ of Theorem 2 in the outputs as given; ``"free"`` any W with ``W
-        Upsilon = I``, of little noise for the gamma that is shipped; or a matrix ``(nf, ny)`` with ``W Upsilon = I``,
-        in units of faults by outputs (``gains["Upsilon"]`` of any design with the same T).  By default the free one,
-        unless no noise is stated and it lowers the least gamma by less than 5 %; a note gives both.  With S or
-        bisection the paper's.  Over a region the free one by default, constant, and no matrix.
+        Residual weight W.  ``"paper"`` is W = Upsilon^+ of Theorem 2 in the given units of the outputs.  ``"free"`` is
+        a W with ``W Upsilon = I`` and little noise for the shipped gamma.  A matrix ``(nf, ny)`` with
+        ``W Upsilon = I`` is in units of faults by outputs (``gains["Upsilon"]`` of any design with the same T).  By
+        default W is free, unless no noise is stated and a free W lowers the least gamma by less than 5 %; a note gives
+        both values.  With S or bisection the default is the paper's.  Over a region W is free and constant by default,
+        and no matrix is allowed.
     residual_weight_limit : float, optional
         Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
         The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
     engine : {"auto", "riccati", "lmi"}, optional
-        Who finds the gains: Riccati equations alone, which serve hundreds of states; or the paper's inequality as
-        well, as `obsynth.conditions.wang2015` has it, for the last digits of gamma and, with up to 20 states, smaller
-        gains (some seconds at 16 states).  By default the equations; the inequality where what they find does not keep
-        ``residual_weight_limit``, where ``gamma`` is below what they found or less than 1e-4 above (up to 20 states),
-        and where up to 12 states have no filter of theirs.  The result's ``solver["engine"]`` says which ran.  The
-        inequality is what is verified in each case.
+        How the gains are computed: by Riccati equations alone, also for hundreds of states; or with the paper's
+        inequality (`obsynth.conditions.wang2015`) as well, for the last digits of gamma and, with up to 20 states,
+        smaller gains (some seconds at 16 states).  By default by the equations.  The inequality is solved where their
+        result does not keep ``residual_weight_limit``, where ``gamma`` is below their least one or less than 1e-4 above
+        it (up to 20 states), and where they have no filter for up to 12 states.  The result's ``solver["engine"]``
+        says which ran.  In each case the inequality is verified.
     solver : str, optional
         Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached: any of
         ``cvxpy.installed_solvers()`` that does semidefinite programmes.
@@ -83,28 +84,29 @@ class FaultEstimationFilter(Method):
         Settings of that solver by its own names, such as ``{"max_iter": 200}`` for CLARABEL.
     constraints : callable, optional
         A function of the variables of `obsynth.conditions.wang2015` by name that returns cvxpy constraints:
-        ``lambda v: [cvxpy.norm(v["Y"], 2) <= 3]``.  (45) is then solved as it stands in the paper, not by an engine.
+        ``lambda v: [cvxpy.norm(v["Y"], 2) <= 3]``.  (45) is then solved as in the paper, not by an engine.
     objective : "h2" or callable, optional
-        What is minimised instead of gamma and the size of the gains: the H2 norm from disturbances and noise, taken as
-        unit white noise, to the fault errors; or a function of the variables, among them ``Z`` with "h2" as trace.
+        Objective to be minimised, in place of gamma and the size of the gains: the H2 norm from disturbances and noise,
+        as unit white noise, to the fault errors; or a function of the variables.  With "h2" the problem has a further
+        variable ``Z`` whose trace is the squared norm.
     region : LMIRegion, optional
-        Where all eigenvalues of the filter must lie (dimensionless), such as ``conditions.disk(0, 0.3)``; 0 among
-        them, where the filter always has some.  It shares P with the other inequalities, which may cost more than it
-        must.
+        Region of all eigenvalues of the filter (dimensionless), such as ``conditions.disk(0, 0.3)``.  It has to contain
+        0, where the filter always has eigenvalues.  It shares P with the other inequalities, which may increase gamma
+        more than necessary.
     decay : float, optional, 1/seconds
         Errors decay at least like ``exp(-decay t)``: the disk of radius ``exp(-decay dt)``.
     tolerance : float, optional
         Relative width of the bracket at which bisection ends.
     prove_least : bool, optional
-        Whether a proof is sought at any price that no filter has a smaller gain than the least one found: by the dual
-        inequalities of up to 24 states, which take a semidefinite solver and several times as long as the design.  By
-        default a proof is made where disturbances of a few samples are one.  The row "least gain" says which it is.
+        Prove that no filter has a smaller gain than the least one that was found, also by the dual inequalities (up to
+        24 states), which need a semidefinite solver and several times the time of the design.  By default
+        only proofs by disturbances over a few samples are tried.  The row "least gain" says whether there is a proof.
     mean : int, optional, samples
-        Over how many samples each fault estimate is averaged; adds ``(mean - 1) // 2`` to its delay.  The gain gamma is
-        proved for the estimate before the mean, which makes no l2 norm larger.
+        Number of samples over which each fault estimate is averaged; this adds ``(mean - 1) // 2`` to its delay.  The
+        gain gamma is proved for the estimate before averaging, which increases no l2 norm.
     steady_error_limit : float, optional
-        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
-        design beyond it is refused.
+        Largest steady error of the estimate of a constant fault, as a share of the fault, proved on plant and stored
+        numbers; a design with a larger error is refused.
     name : str, optional
         Name of the design.
 
@@ -198,11 +200,11 @@ class FaultEstimationFilter(Method):
     steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
-        """Whether the free matrix of the paper is given."""
+        """Whether the option S, the free matrix of the paper, is given."""
         return self.S is not None
 
     def conflicts(self) -> Iterator[str]:
-        """Yield a sentence for each rule across options that is broken."""
+        """Yield a sentence for each pair of options that exclude each other."""
         if self.weight is not None and not self._is_free and self.residual_weight_limit is not None:
             yield "residual_weight_limit needs a free weight: leave weight out, or set weight: free."
         if self.residual_weight_limit is not None and self.engine == "riccati":
@@ -222,7 +224,7 @@ class FaultEstimationFilter(Method):
 
     @property
     def asks_for_free_weight(self) -> bool | None:
-        """Whether W is asked to be free; ``None``: nothing is said of it."""
+        """Whether the options request a free W; ``None`` where they leave it open."""
         if self.weight is not None:
             return self._is_free
         if self.residual_weight_limit is not None:

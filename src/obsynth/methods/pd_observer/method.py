@@ -33,72 +33,72 @@ SPARE_LMI_UP_TO = 50
 class PdObserver(Method):
     r"""Design a PD observer that estimates the states and the faults of a continuous-time plant.
 
-    The estimates of states and slowly varying faults converge to them from any start; what is left is the effect of
-    the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
+    The estimates of states and slowly varying faults converge from any initial error.  The remaining errors are effects
+    of the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
 
-    Where the plant states noise of its sensors and has up to ten unknown states, and nothing but a decay rate is asked
-    for, a sensor more never makes the fault estimates noisier at that rate (by more than 1 %): one that the smallest
-    gains use badly is left out, and a note names it.  Noisier is meant of the standard deviation of the fault errors,
-    seen through a lag as fast as the plant's fastest mode.
+    If the plant states sensor noise and has up to ten unknown states, and the only requirement is a decay rate, then an
+    additional sensor never increases the noise of the fault estimates at that rate (by more than 1 %).  A sensor for
+    which the smallest gains would do so is left out, and a note names it.  Noise is the standard deviation of the fault
+    errors, behind a lag as fast as the plant's fastest mode.
 
     Parameters
     ----------
     plant : DescriptorSystem or Transformation
         Continuous time (``dt == 0``), ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``; ``E`` may be singular of index
-        1 (its algebraic states are eliminated); feedthrough ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
+        1 (its algebraic states are eliminated); feedthrough ``D, Df, Dd`` and noise ``Bw, Dw`` are allowed.
     theorem : {1, 2}, optional
-        2 takes a symmetric P3, which makes the proportional part of the augmented plant stable as well, and costs
-        larger gains.
+        Theorem 2 has a symmetric P3, which also makes the proportional part of the augmented plant stable, at the cost
+        of larger gains.
     delta : float, optional, seconds
-        Parameter of the theorem.  It decides which gains are found, not whether there are any (Theorem 1).  By default
-        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
-        ``"riccati"`` may take less.
+        Parameter of the theorem.  It affects the gains, but not whether gains exist (Theorem 1).  By default the
+        inverse of the plant's fastest mode, not counting well-damped modes far beyond all others; the engine
+        ``"riccati"`` may use less.
     decay : float, optional, 1/seconds
-        Errors decay at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
-        tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; up to 20 unknown
-        states these gains are small in the plant's own units, and the same in any.  0 imposes nothing: then, and for a
-        rate that is given, gains are small in the given units.
+        Errors decay at least like ``exp(-decay t)``.  By default no rate is imposed if the smallest gains reach a tenth
+        of the plant's fastest mode; otherwise that rate is imposed, or as much of it as moderate gains allow.  With up
+        to 20 unknown states these gains are small in the plant's natural units, and hence independent of the given
+        ones.  0 imposes no rate.  Then, and with a given rate, gains are small in the given units.
     disk : array_like, optional, 1/seconds
         ``[c, r]``: every eigenvalue s of the error system has ``|s + c| < r``.
     gain_bound : float, optional
-        Bound on the spectral norm of ``[J L; G M, G N]``, in the user's units.
+        Bound on the spectral norm of ``[J L; G M, G N]``, in the given units.
     fault_rate_gain : float, optional, seconds
         Bound on the l2 gain from the rate of the faults to the fault error.
     noise_gain : float, optional
-        Bound on the l2 gain from the noise and its derivative (per second), taken as separate inputs, to the fault
-        error; unit noise on every output where the plant states none.
+        Bound on the l2 gain from the noise and its derivative (per second), as separate inputs, to the fault error; for
+        unit noise on every output if the plant states none.
     adaptation_gain : array_like, optional, dimensionless
-        G ``(nf, nf)`` of (25), nonsingular: the loop integrates ``G (M e + N e')``, and the design is for it.
+        Nonsingular G ``(nf, nf)`` of (25): the loop integrates ``G (M e + N e')``, as the design assumes.
     adaptation_range : array_like, optional, dimensionless
         ``[low, high]``: one design that is stable for every ``G = g I`` with g in this range.
     engine : {"auto", "lmi", "riccati"}, optional
-        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.  ``"riccati"``
-        takes gains with L = 0 from a Riccati equation, and their certificate from a Lyapunov equation: for stability
-        and a decay rate alone.  ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the
-        second above.  The result's ``solver["engine"]`` says which ran.
+        How the gains are computed.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.
+        ``"riccati"`` computes gains with L = 0 from a Riccati equation, and their certificate from a Lyapunov equation,
+        for stability and a decay rate only.  ``"auto"`` is ``"lmi"`` for up to 20 unknown states or further
+        requirements, and ``"riccati"`` otherwise.  The result's ``solver["engine"]`` says which ran.
     solver : str, optional
-        Semidefinite solver: any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+        Semidefinite solver: any of ``cvxpy.installed_solvers()`` for semidefinite programmes.
     solver_options : mapping, optional
         Settings of that solver by its own names.
     constraints : callable, optional
         A function of the variables of `obsynth.conditions.filasova_theorem1` by name that returns cvxpy constraints:
-        ``lambda v: [v["Z"] == 0]``.  The theorem is then solved as it stands in the paper, with the safe reading.
+        ``lambda v: [v["Z"] == 0]``.  The theorem is then solved as in the paper, with the safe reading.
     objective : callable, optional
-        A function of the variables that returns what is minimised instead of the size of Y, Z and P3.
+        A function of the variables that returns the objective to be minimised, in place of the size of Y, Z and P3.
     region : LMIRegion, optional
-        Where all eigenvalues of the error system must lie (1/s), such as ``conditions.sector(0.7)``.
+        Region of all eigenvalues of the error system (1/s), such as ``conditions.sector(0.7)``.
     steady_error_limit : float, optional
-        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
-        design beyond it is refused.
+        Largest steady error of the estimate of a constant fault, as a share of the fault, proved on plant and stored
+        numbers; a design with a larger error is refused.
     name : str, optional
         Name of the design.
 
     Returns
     -------
     ObserverDesign
-        ``gains``: ``J, L (nx, ny)``, ``M, N (nf, ny)`` and, where asked for, ``G (nf, nf)``.  ``observer`` is the same
-        in a form without derivatives; `obsynth.sample_observer` makes it run on samples.  ``certificate.claims``:
-        ``theorem``, ``delta``, ``decay`` and the bounds asked for.
+        ``gains``: ``J, L (nx, ny)``, ``M, N (nf, ny)`` and, if requested, ``G (nf, nf)``.  ``observer`` is a
+        realisation without derivatives; `obsynth.sample_observer` makes it run on samples.  ``certificate.claims``:
+        ``theorem``, ``delta``, ``decay`` and the requested bounds.
 
     Raises
     ------
@@ -106,10 +106,10 @@ class PdObserver(Method):
         An option is out of range.
     PreconditionError
         A discrete plant, a plant that is not regular or of index 2 or more, ``nf > ny``, dependent faults, a mode that
-        neither decays nor shows in the outputs, or ``rank [A Bf; C Df] < nx + nf`` (eq. (3)): a zero at s = 0.
+        is neither stable nor observable, or ``rank [A Bf; C Df] < nx + nf`` (eq. (3)), that is a zero at s = 0.
     InfeasibleError
-        An unobservable mode is slower than ``decay`` or outside ``disk``; ``noise_gain`` is below what reading a
-        constant fault takes; delta cannot serve Theorem 2 or the disk.
+        An unobservable mode is slower than ``decay`` or outside ``disk``; ``noise_gain`` is below the least gain of any
+        estimate of constant faults; delta excludes Theorem 2 or the disk.
     SolverError
         The result is inconclusive.
     VerificationError
