@@ -23,53 +23,53 @@ from obsynth.verification.over_region import DECAY_ROW, DEVIATION_ROW, GAIN_WITN
 class DescriptorKalman(Method):
     r"""Design the Kalman filter of a descriptor plant, time-varying or not.
 
-    The estimate at k is the maximum-likelihood estimate of x(k) from y(1) ... y(k) and u(0) ... u(k - 1), computed by
-    orthogonal factorisations alone, so that covariances may be singular and rows may hold exactly.
+    The estimate at k is the maximum-likelihood estimate of x(k) from y(1) ... y(k) and u(0) ... u(k - 1).  It is
+    computed by orthogonal factorisations only, so that covariances may be singular and equations may be exact.
 
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem, DescriptorSystem or PolytopicSystem
-        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time.  What known inputs do to the
-        outputs at once, ``D u``, is subtracted.  Its parameters are taken as zero.  Nothing is assumed about its
-        unknown inputs: those that show in the outputs at once become states of the filter, and are estimated; the
-        equations that the others enter are left out (all of them, where need be). Over the region of a PolytopicSystem
-        a scheduled observer is designed, with constant Q and R and no other option: its gains are steady at each
-        vertex, and the mean square of its errors is proved for every course of the parameters.
+        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time.  The direct effect of known inputs
+        on the outputs, ``D u``, is subtracted.  Parameters count as zero.  Unknown inputs are arbitrary: those with a
+        direct effect on the outputs become states of the filter and are estimated; the equations that the others enter
+        are left out (all of them, if necessary).  For a PolytopicSystem a scheduled observer is designed, with constant
+        Q and R and no other option.  Its gains are steady at each vertex, and the mean square of its errors is proved
+        for all parameter trajectories.
     Q : MatrixLike, optional
-        Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
-        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity
-        (in natural units where the plant's are far from these).  Noise of a plant that drives equations and outputs at
-        once, ``Bw Dw'`` not zero, becomes states of the filter, which are estimated, where neither Q nor R is stated.
-        Of a plant of index 2 or more, which is reduced, a constant one of the equations as written is carried to the
-        free states (it is refused where noise in a constraint would be needed at another time), as are
-        ``initial_state`` and ``initial_covariance``.
+        Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number means
+        that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity (in
+        natural units, if the plant's units are far from these).  If neither Q nor R is given, noise that drives
+        equations and outputs at once (``Bw Dw'`` not zero) becomes states of the filter, which are estimated.  A plant
+        of index 2 or more is reduced.  A constant Q of its equations is then transformed to the remaining states, as
+        are ``initial_state`` and ``initial_covariance``; it is refused if noise in a constraint would be needed at
+        another time.
     R : MatrixLike, optional
-        Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
+        Covariance ``(ny, ny)`` of nu(k); by default ``Dw Dw'`` of a DescriptorSystem with noise, else the identity.
     initial_state : array_like, optional
         Mean of x(0), ``(nx,)``; zeros by default.
     initial_covariance : array_like, optional
         ``P_0 (nx, nx)``; by default the identity, as for Q.
     early_constraints : bool, optional
-        Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
-        which `step` has; Q must not couple them with the others.
+        Use equations of step k + 1 without x(k + 2) already for x(k + 1).  They need u(k + 1), which `step` has; Q must
+        not couple them with the other equations.
     outliers : {"none", "gate", "huber"}, optional
-        What is done with a sample that its prediction excludes: taken as it is (``none``); left out, at most twice in a
-        row of one sensor (``gate``); or taken at the limit (``huber``, Huber's weight).  By default samples are taken
-        as they are, but for a run on data, and a C or FMU file of a nonlinear design, which have a gate.  An option
-        that is stated holds everywhere.
+        Treatment of a sample that is too far from its prediction: it is used (``none``); rejected, at most twice in a
+        row for one sensor (``gate``); or replaced by the limit (``huber``, Huber's weight).  By default there is a gate
+        in a run on data, and in a C or FMU file of a nonlinear design, and none elsewhere.  A stated option holds
+        everywhere.
     outlier_limit : float, optional
-        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+        Limit in standard deviations of the prediction: by default 6 for ``gate`` and 3 for ``huber``.
     outlier_sizes : array_like or mapping, optional
-        ``(ny,)``, or values by name, in units of the sensors: a sample that is nearer than this to its prediction is no
-        outlier, however many deviations it is off. `calibrate` finds them where a log has outliers. Of these sensors
-        two outliers in a row are left out, too.
+        Least deviations of outliers from their prediction, ``(ny,)`` or by name, in units of the sensors: smaller
+        deviations are no outliers, whatever the limit is.  `calibrate` estimates them from a log with outliers.  For
+        these sensors two outliers in a row are rejected.
     sensors : mapping, optional
-        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
-        holds in the other rows is not used), or whose values are delayed by D rows: the value in row k is then that of
-        ``k - D``, where the observer puts it, taking the rows after it again.
+        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; the values of a
+        log in other rows are not used), or whose values are delayed by D rows.  The value in row k then belongs to row
+        ``k - D``, and the observer repeats the rows from there on.
     state_bounds : mapping or array_like, optional
-        ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
-        covariance, which stays as it is without them. The recursion goes on without them.
+        ``{name: [low, high]}``, or ``(nx, 2)``: reported estimates are projected onto these bounds in the metric of
+        their covariance.  Covariance and recursion do not change.
     name : str, optional
         Name of the design.
 

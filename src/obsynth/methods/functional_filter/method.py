@@ -25,65 +25,68 @@ from obsynth.verification.error_system import ErrorModel
 
 @dataclass(frozen=True)
 class FunctionalFilter(Method):
-    r"""Design a filter that estimates the faults asked for and nothing else, or residuals that show them.
+    r"""Design a filter that estimates selected faults only, or residuals that they affect.
 
-    The unknown inputs are taken out of the plant first, whatever its index; on what is left, whose known inputs are u
-    and y, faults are walks of their models and a Kalman gain with correlated noise is chosen.  It exists for every
-    plant on which the fault can be distinguished from the rest, also where no observer of the whole state does.
+    First the unknown inputs are removed from the plant, whatever its index.  In the remaining system, with known inputs
+    u and y, the faults follow their models driven by noise, and the gain is a Kalman gain for correlated noise.  The
+    filter exists for every plant on which the fault can be distinguished from the rest, also where no observer of the
+    whole state exists.
 
     Parameters
     ----------
     plant : DescriptorSystem or Transformation
-        Either time, any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``D, Df, Dd`` allowed.
+        Discrete or continuous time, any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``D, Df, Dd`` are
+        allowed.
     faults : sequence of str, optional
-        Faults to estimate, all by default.  The others are treated like unknown inputs: no estimate sees them.
+        Faults to be estimated, all by default.  The other faults are treated like unknown inputs.
     joint : bool, optional
-        One filter for all faults asked for: of lower order, and less noisy, but each estimate is free of the other
-        faults only where these follow their models.  By default each is free of all others whatever their time course.
+        One filter for all selected faults, with lower order and less noise.  Each estimate is then decoupled from the
+        other faults only if these follow their models.  By default each is decoupled from all others, whatever their
+        profiles are.
     fault_model : str, mapping or FaultModel, optional
-        How faults run, as for `ui_pi_observer`.
+        Model of the faults over time, as for `ui_pi_observer`.
     fault_rate : float or mapping of str to float, optional
-        How far each fault walks per sample (per square root of a second for ``dt == 0``), a standard deviation in the
-        fault's unit: what noise is weighed against.  By default the slowest walk that shows a step in about the
-        plant's own time; see the note of the design.
+        Standard deviation of the random change of each fault per sample (per square root of a second for ``dt == 0``),
+        in the fault's unit; the gain weighs it against the noise.  By default the slowest walk with which a step shows
+        within the plant's settling time; see the note of the design.
     delay : int, optional, samples
-        Fixed lag: the estimate at k is of the fault at ``k - delay``, with what came after it taken into account.
+        Fixed lag: the estimate at k is of the fault at ``k - delay``, and uses the samples after that.
     mean : int, optional, samples
-        How many estimates are averaged; adds ``(mean - 1) // 2`` to the delay.
+        Number of estimates that are averaged; this adds ``(mean - 1) // 2`` to the delay.
     decay : float, optional, 1/s
         Every error decays at this rate or faster.
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
-        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`; where several filters are asked for
-        (one for each fault, or set of faults), a list of poles for each.
+        Poles of the filter in place of a Kalman gain, as for `ui_pi_observer`; for several filters (one for each fault,
+        or set of faults) a list of poles for each.
     noise : float or mapping of str to float, optional
-        Standard deviation of each output that the gain is for, per sample; what the plant states by default.
+        Standard deviation of each output, per sample, for which the gain is designed; by default the plant's noise.
     states : sequence of str, optional
-        States to estimate, free of all unknown inputs and faults: with ``functionals`` of the plant any ``K x``.  The
-        observer has the order of Darouach's functional observer where his conditions hold, and as many states more as
-        it takes elsewhere; ``decay`` or ``poles`` choose its dynamics.  Faults are estimated beside only where
-        ``faults`` names them.
+        States to be estimated, decoupled from all unknown inputs and faults; with ``functionals`` of the plant any
+        ``K x``.  The observer has the order of Darouach's functional observer where his conditions hold, and as many
+        more states as necessary elsewhere; ``decay`` or ``poles`` set its dynamics.  Faults are estimated as well only
+        if ``faults`` names them.
     residuals : {"detect", "isolate"} or sequence, optional
-        Only residuals, blind to the unknown inputs: one set that sees every fault, one set for each fault that is
-        blind to all others, or one for each list of faults to see.
+        Only residuals, decoupled from the unknown inputs: one set that all faults affect, one set for each fault that
+        no other fault affects, or one set for each given list of faults.
     steady_error_limit : float, optional
-        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
-        design beyond it is refused.
+        Largest steady error of the estimate of a constant fault, as a share of the fault, proved on plant and stored
+        numbers; a design with a larger error is refused.
     name : str, optional
         Name of the design.
 
     Returns
     -------
     ObserverDesign
-        An observer without state rows but those of ``states``; ``gains`` and the certificate hold ``T (nz, nx)`` and
-        ``T0 (rows, nx)``, which prove that neither state, nor u, nor d reaches any estimate.
+        An observer with rows of states only for ``states``.  ``gains`` and the certificate hold ``T (nz, nx)`` and
+        ``T0 (rows, nx)``, which prove that neither the state, nor u, nor d affects the error of any estimate.
 
     Raises
     ------
     SpecError
-        An option is malformed, or ``delay`` or ``mean`` are asked for in continuous time.
+        An option is malformed, or ``delay`` or ``mean`` is given in continuous time.
     PreconditionError
-        A fault cannot be distinguished from the rest: what hides it, and which sensors would help, is said.  Or an
-        output has no stated noise.
+        A fault cannot be distinguished from the rest (the message says what hides it, and which sensors would help), or
+        an output has no stated noise.
     SolverError
         The Riccati equation has no usable solution, or poles could not be placed.
     VerificationError

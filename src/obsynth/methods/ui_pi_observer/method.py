@@ -28,67 +28,69 @@ if TYPE_CHECKING:
     from obsynth.verification.requested_limits import Limits
 
 
-#: What to make of the freedom that poles leave.
+#: Objectives for the freedom that given poles leave in the gain.
 OBJECTIVES = ("conditioning", "gain")
 
-#: The row on the noise of an observer over a region.
+#: Name of the row on the noise of an observer over a region.
 NOISE_AT_REST_ROW = "noise amplification at rest"
 
 
 @dataclass(frozen=True)
 class UiPiObserver(Method):
-    r"""Design an unknown-input PI observer: state and faults, untouched by any unknown input.
+    r"""Design an unknown-input PI observer: estimates of state and faults, decoupled from all unknown inputs.
 
-    The estimates converge to the state and to every fault that follows its model, whatever the unknown inputs do.
-    Without poles, decay or region: the fastest Kalman gain, up to the median speed of the plant's own modes, that
-    costs no fault estimate more than ten times the noise of the quietest one.  The units of the data play no role: they
-    are chosen by the plant itself, and undone in the gains.
+    The estimates converge to the state and to every fault that follows its model, for arbitrary unknown inputs.
+    Without poles, decay or region the gain is the fastest Kalman gain, up to the median rate of the plant's modes, with
+    which no fault estimate has more than ten times the noise of the quietest gain.  The design does not depend on the
+    units of the data: it is computed in natural units of the plant.
 
     Parameters
     ----------
     plant : DescriptorSystem, PolytopicSystem or Transformation
-        Either time, ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd, D`` allowed; it need
-        be neither regular nor of index 1.  Over the region of a PolytopicSystem a scheduled observer is designed, with
-        proofs for every course of the parameters: outputs constant, faults and unknown inputs as they like; options
-        fault_model, decay, noise, solver and solver_options.
+        Discrete or continuous time, ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``Df, Dd, D`` are
+        allowed.  The plant need not be regular or of index 1.  For a PolytopicSystem a scheduled observer is designed,
+        with proofs for all parameter trajectories.  Its outputs have to be constant, while faults and unknown inputs
+        may change.  Options are then fault_model, decay, noise, solver and solver_options.
     fault_model : str, mapping or FaultModel, optional
-        How faults run: ``"step"``, ``"ramp"``, ``"parabola"``, ``{"polynomial": order}``, ``{"sinusoid": rad/s}``,
-        ``{"exponential": 1/s}``, ``{"Phi": ..., "Cw": ...}``, ``{"sum": [...]}``; one for all, or by fault name.
+        Model of the faults over time: ``"step"``, ``"ramp"``, ``"parabola"``, ``{"polynomial": order}``,
+        ``{"sinusoid": rad/s}``, ``{"exponential": 1/s}``, ``{"Phi": ..., "Cw": ...}``, ``{"sum": [...]}``; one for all
+        faults, or by fault name.
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
-        Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.  Where
-        the plant states noise of its sensors, outputs that make the fault estimates noisier (standard deviation of
-        their errors, by more than 1 %) with these poles are left out, and a note names them.
+        Movable poles: numbers, complex numbers or ``[re, im]`` of any multiplicity, without the fixed ones.  If the
+        plant states sensor noise, outputs that increase the noise of the fault estimates (standard deviation of their
+        errors, by more than 1 %) with these poles are left out, and a note names them.
     decay : float, optional, 1/s
-        The Kalman gain of the least prescribed rate (Anderson, Moore 1971) with which all movable poles decay at this
-        rate or faster: a gain of the rate itself is faster, and noisier.  0 is the plain Kalman gain.
+        All movable poles decay at this rate or faster.  The gain is the Kalman gain of the least prescribed rate
+        (Anderson, Moore 1971) for which they do; that of the rate itself is faster and noisier.  0 is the plain Kalman
+        gain.
     region : mapping or LMIRegion, optional
-        ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
-        where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without
-        ``decay``: that of the default, where it can be had (at most half the radius).
+        ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles are placed in this region by a matrix
+        inequality, with little noise.  Of more than 20, those stay that a Kalman gain of this rate places inside.
+        Without ``decay`` the default rate is used if it is at most half the radius.
     noise : mapping, optional
         Weights of the Kalman gain: ``measurement`` (standard deviation: one, a list, or by output; the plant's own
         noise by default), ``process`` and ``fault`` (drive of states and fault models, relative to the default,
         dimensionless).
     objective : {"conditioning", "gain"} or callable, optional
-        What to make of the freedom that ``poles`` leaves; or a function of the variables of the inequality that
-        returns what is minimised.  With ``conditioning``, where the plant states noise of its sensors, gains near the
-        best conditioned ones with less noise in the fault estimates are taken; their eigenvectors have at most 30 times
-        the condition.
+        Objective for the freedom that ``poles`` leaves in the gain, or a function of the variables of the inequality
+        that returns the objective to be minimised.  With ``conditioning``, if the plant states sensor noise, a gain
+        near the best conditioned one with less noise in the fault estimates is chosen; its eigenvectors have at most 30
+        times the condition.
     joint : bool, optional
-        Design K and the free part of the decoupling (the paper's G) together; the fault estimates may then see the
-        outputs directly.
+        Design K and the free part of the decoupling (the paper's G) together; the fault estimates may then depend on
+        the outputs directly.
     E_sharp, C_sharp, G : array_like, optional
-        The paper's ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of (10), (11), instead of our decoupling.
+        The paper's ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of (10), (11), in place of the default decoupling.
     solver : str, optional
-        Semidefinite solver, for ``region``: any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+        Semidefinite solver for ``region``: any of ``cvxpy.installed_solvers()`` for semidefinite programmes.
     solver_options : mapping, optional
         Settings of that solver by its own names.
     constraints : callable, optional
-        A function of the variables of `obsynth.conditions.sharepasand` by name that returns cvxpy constraints.  The
-        inequality is then solved as it stands there, as it is with a region of `obsynth.conditions`.
+        A function of the variables of `obsynth.conditions.sharepasand` by name that returns cvxpy constraints.  That
+        inequality is then solved unchanged, as it is for a region of `obsynth.conditions`.
     steady_error_limit : float, optional
-        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
-        design beyond it is refused.
+        Largest steady error of the estimate of a constant fault, as a share of the fault, proved on plant and stored
+        numbers; a design with a larger error is refused.
     name : str, optional
         Name of the design.
 
@@ -96,8 +98,8 @@ class UiPiObserver(Method):
     -------
     ObserverDesign
         ``gains``: ``U_a, D_a, K_a, Ahat, Bhat, Jhat`` of the augmented plant, ``Phi, Cw`` of the fault model and,
-        unless ``joint``, ``U (nx, nx)``, ``D (nx, ny)``, ``K (nx, ny)``, ``F (nw, ny)``, ``Hhat (nx, nf)``.  Where
-        algebraic states had to be eliminated, ``plant`` is the plant without them and ``recovery`` the way back.
+        unless ``joint``, ``U (nx, nx)``, ``D (nx, ny)``, ``K (nx, ny)``, ``F (nw, ny)``, ``Hhat (nx, nf)``.  If
+        algebraic states had to be eliminated, ``plant`` is the plant without them, and ``recovery`` recovers them.
 
     Raises
     ------
@@ -107,7 +109,7 @@ class UiPiObserver(Method):
     PreconditionError
         (D1), (D2) or (D3) fails: the eigenvalue, and the fault and disturbance that mask each other, are named.
     SolverError
-        Poles could not be placed, or the solver found nothing: the result is inconclusive.
+        Poles could not be placed, or the solver found no gain: the result is inconclusive.
     VerificationError
         The shipped realisation fails a check.
 
@@ -186,11 +188,11 @@ class UiPiObserver(Method):
 
     @property
     def leaves_freedom_to_us(self) -> bool:
-        """Whether poles are given, and what they leave free is spent as the defaults have it."""
+        """Whether poles are given with the default objective and decoupling."""
         return self.poles is not None and self.objective == "conditioning" and self.G is None
 
     def conflicts(self) -> Iterator[str]:
-        """Yield a sentence for each rule across options that is broken."""
+        """Yield a sentence for each pair of options that exclude each other."""
         placements = [name for name in ("poles", "decay", "region") if getattr(self, name) is not None]
         if len(placements) > 1:
             yield f"{' and '.join(placements)} are given: use one of them."
