@@ -130,14 +130,28 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
     return solved(problem, what, solver)
 
 
-def solved(problem: Any, what: str, solver: str) -> dict[str, Any]:
-    """Solve a problem by one solver and return the record."""
+def solve_again(problem: Any) -> None:
+    """Solve a problem by Clarabel with the present values of its parameters: its canonical form is made once.
+
+    What is zero with these values is left out, so that the solver gets what it would without parameters."""
+    data, chain, way_back = problem.get_problem_data("CLARABEL", solver_opts={})
+    data["A"] = data["A"].copy()  # its indices may be those of the canonical form
+    data["A"].eliminate_zeros()
+    found = chain.solve_via_data(problem, data, warm_start=False, verbose=False, solver_opts={})
+    problem.unpack_results(found, chain, way_back)
+
+
+def solved(problem: Any, what: str, solver: str, *, run: Callable[[Any], None] | None = None) -> dict[str, Any]:
+    """Solve a problem by one solver, or by ``run``, and return the record."""
     settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
     record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}
     try:
         with warnings.catch_warnings(action="ignore"):
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
-            problem.solve(solver=solver, **settings)
+            if run is None:
+                problem.solve(solver=solver, **settings)
+            else:
+                run(problem)
         stats = problem.solver_stats
         iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)
         record |= {"status": str(problem.status), "iterations": iterations}

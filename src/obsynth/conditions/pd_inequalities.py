@@ -11,8 +11,10 @@ What is minimised keeps P3 from singular: plain feasibility gave gains of 1e9, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,13 @@ from obsynth.conditions.filasova import PD_MARGIN
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.doubling import symmetric
+
+#: Up to so many states plants of one size share a canonical form, of as many sizes at a time: cvxpy takes several times
+#: as long to make one as Clarabel to solve it, and a design solves a hundred.
+STATES_OF_COMMON_FORMS, COMMON_FORMS = 12, 16
+
+#: The theorem with a symmetric P3.
+SYMMETRIC_THEOREM = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +52,11 @@ class PdTask:
     process: FloatArray  # (n, nw)
     sensor: FloatArray  # (ny, nw)
     sensor_rate: FloatArray  # (ny, nw), of the noise's derivative
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether stability and a decay rate are all that is asked."""
+        return all(one is None for one in (self.disk, self.gain_bound, self.rate_gain, self.noise_gain))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,27 +80,89 @@ class _Variables:
 def solve(task: PdTask, *, solver: str) -> PdSolution:
     """Return the gains of least size that meet the task."""
     n, ny = task.plants[0][1].shape[1], task.plants[0][1].shape[0]
-    p3 = lmi.symmetric_variable(n) if task.theorem == 2 else lmi.matrix_variable(n, n)
-    z = lmi.matrix_variable(n, ny)
-    variables = _Variables(p3, lmi.matrix_variable(n, ny), z)
-    own = [lmi.symmetric_variable(n) for _ in task.plants]
-    constraints = [lmi.at_least(2.0 * p3, 2.0)]
+    has_default = str(solver) == "CLARABEL" and not getattr(solver, "options", None)
+    if task.is_plain and has_default and ny and n <= STATES_OF_COMMON_FORMS:
+        form = _common_form(n, ny, len(task.plants), task.theorem)
+        with form.lock:
+            form.take(task)
+            what = f"a PD observer by Theorem {task.theorem}"
+            record = lmi.solved(form.problem, what, solver, run=lmi.solve_again)
+            return _solution(task, form.variables, form.own, record)
+    variables, own = _variables(n, ny, len(task.plants), task.theorem)
+    constraints = [lmi.at_least(2.0 * variables.P3, 2.0)]
     for (a, c), p in zip(task.plants, own, strict=True):
         constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, variables, a, c, p), -PD_MARGIN)]
     constraints += _further(task, variables)
-    size = cp.norm(cp.hstack([variables.Y, variables.Z]), "fro") + cp.norm(cp.hstack([p3]), "fro")
-    record = lmi.minimise(size, constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
-    p3_value = lmi.value_of(p3)
+    record = lmi.minimise(_size(variables), constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
+    return _solution(task, variables, own, record)
+
+
+def _variables(n: int, ny: int, plants: int, theorem: int) -> tuple[_Variables, list[Any]]:
+    """Return the common variables, and P of each plant."""
+    p3 = lmi.symmetric_variable(n) if theorem == SYMMETRIC_THEOREM else lmi.matrix_variable(n, n)
+    z = lmi.matrix_variable(n, ny)
+    return _Variables(p3, lmi.matrix_variable(n, ny), z), [lmi.symmetric_variable(n) for _ in range(plants)]
+
+
+def _size(variables: _Variables) -> Any:
+    return cp.norm(cp.hstack([variables.Y, variables.Z]), "fro") + cp.norm(cp.hstack([variables.P3]), "fro")
+
+
+def _solution(task: PdTask, variables: _Variables, own: Sequence[Any], record: Mapping[str, Any]) -> PdSolution:
+    p3_value = lmi.value_of(variables.P3)
     try:
         gain_j, gain_l = (
             np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (variables.Y, variables.Z)
         )
     except np.linalg.LinAlgError as error:
         raise SolverError("The solver returned a singular P3: the result is inconclusive.", record=record) from error
-    p1 = tuple(symmetric(lmi.value_of(p)) for p in own)
-    return PdSolution(
-        gain_j + task.decay * gain_l, gain_l, p1, symmetric(p3_value) if task.theorem == 2 else p3_value, record
-    )
+    p1, p3 = tuple(symmetric(lmi.value_of(p)) for p in own), p3_value
+    is_symmetric = task.theorem == SYMMETRIC_THEOREM
+    return PdSolution(gain_j + task.decay * gain_l, gain_l, p1, symmetric(p3) if is_symmetric else p3, record)
+
+
+@dataclass(frozen=True, eq=False)
+class _CommonForm:
+    """The inequalities of stability with the plants' numbers as parameters, for one task at a time."""
+
+    problem: Any
+    variables: _Variables
+    own: Sequence[Any]
+    double_delta: Any
+    plants: Sequence[Mapping[str, Any]]
+    lock: Lock
+
+    def take(self, task: PdTask) -> None:
+        """Put the numbers of a task in place; products of numbers are parameters of their own."""
+        self.double_delta.value = 2.0 * task.delta
+        for parameters, (a, c) in zip(self.plants, task.plants, strict=True):
+            shifted = a + task.decay * np.eye(len(a))
+            values = {
+                "A": shifted, "C": c, "delta A": task.delta * shifted, "delta C": task.delta * c,
+                "2 delta C": 2.0 * task.delta * c,
+            }  # fmt: skip
+            for name, value in values.items():
+                parameters[name].value = value
+
+
+@lru_cache(COMMON_FORMS)
+def _common_form(n: int, ny: int, plants: int, theorem: int) -> _CommonForm:
+    (variables, own), double_delta = _variables(n, ny, plants, theorem), cp.Parameter()
+    p3, y, z = variables.P3, variables.Y, variables.Z
+    constraints, shapes = [lmi.at_least(2.0 * p3, 2.0)], {"A": (n, n), "delta A": (n, n)}
+    shapes |= dict.fromkeys(("C", "delta C", "2 delta C"), (ny, n))
+    parameters = [{name: cp.Parameter(shape) for name, shape in shapes.items()} for _ in own]
+    for p, of in zip(own, parameters, strict=True):
+        blocks = [
+            [2.0 * (p3.T @ of["A"] - y @ of["C"])],
+            [
+                p3.T @ of["delta A"] - y @ of["delta C"] - (p3.T + z @ of["C"]).T + p,
+                -(double_delta * p3.T + z @ of["2 delta C"]),
+            ],
+        ]
+        constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]
+    problem = cp.Problem(cp.Minimize(_size(variables)), constraints)
+    return _CommonForm(problem, variables, own, double_delta, parameters, Lock())
 
 
 def _stability(task: PdTask, variables: _Variables, a: FloatArray, c: FloatArray, p: Any) -> Any:
