@@ -138,7 +138,10 @@ class GainProblem:
     def noise_variance(self, solution: Injection) -> float:
         """Return the true total variance of xi under the noise of the problem, with the given gains."""
         if solution not in self._variances:
-            covariance = output_covariance(*self.noise_as_disturbance().closed_loop(solution))
+            r, v = solution.R, solution.V
+            # Of the closed loop with the noise in the disturbance's place; its modes are known or asked for anyway.
+            system = self.A - r @ self.C, self.Bn - r @ self.Dn, self.Z + v @ self.C, self.Zn + v @ self.Dn
+            covariance = output_covariance(*system, is_stable=self.radius(solution) < 1.0)
             self._variances[solution] = float(np.trace(covariance))
         return self._variances[solution]
 

@@ -242,10 +242,14 @@ def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: Fl
     return float(gains[top]), float(angles[top])
 
 
-def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    """Return the covariance ``(p, p)`` of the output under unit white noise; infinite if unstable or on overflow."""
+def output_covariance(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, is_stable: bool = False
+) -> FloatArray:
+    """Return the covariance ``(p, p)`` of the output under unit white noise; infinite if unstable or on overflow.
+
+    ``is_stable``: that ``a`` is stable is known, and its eigenvalues are not computed again."""
     infinite = np.full((c.shape[0], c.shape[0]), np.inf)
-    if not np.all(np.isfinite(a)) or spectral_radius(a) >= 1.0:
+    if not is_stable and (not np.all(np.isfinite(a)) or spectral_radius(a) >= 1.0):
         return infinite
     with np.errstate(over="ignore", invalid="ignore"):
         states, power = b @ b.T, a

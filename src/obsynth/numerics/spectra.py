@@ -255,17 +255,20 @@ def moving_speeds(values: ComplexArray | Sequence[complex], dt: float, rate: flo
     return np.asarray(finite[finite > STANDING * np.max(finite, initial=rate)])
 
 
-def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
+def noise_covariance(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float, *, is_stable: bool = False
+) -> FloatArray:
     """Return the stationary covariance of the output under unit white noise; infinite near instability.
 
     In continuous time of unit intensity, and ``d`` does not count: white noise in an output has no variance.
+    ``is_stable``: that ``a`` is stable is known, and its eigenvalues are not computed again.
     """
     if dt > 0.0:
-        return output_covariance(a, b, c, d)
+        return output_covariance(a, b, c, d, is_stable=is_stable)
 
     if not a.size:
         return np.zeros((c.shape[0], c.shape[0]))
-    if not abscissa(a, dt) < 0.0:
+    if not is_stable and not abscissa(a, dt) < 0.0:
         return np.full((c.shape[0], c.shape[0]), np.inf)
     # In states and a time of their own: units must not cost digits.
     a, b, c = balanced_realisation(a, b, c)

@@ -51,6 +51,9 @@ SILENT = 1e-8
 #: Deviations that differ by more than this share from one choice of states to another are rounding.
 SAME_DEVIATION = 0.1
 
+#: A price nearer to the highest than by this share is told by the improved equation.
+NEAR_THE_PRICE = 0.01
+
 #: Halvings of the default rate before the quietest filter is taken as it is.
 MOST_RATE_HALVINGS = 40
 
@@ -124,11 +127,12 @@ class KalmanProblem:
         return best, noise
 
     def solved(
-        self, decay: float, change: FloatArray, *, only_doubled: bool = False
+        self, decay: float, change: FloatArray, *, only_doubled: bool = False, roughly: bool = False
     ) -> tuple[FloatArray | None, FloatArray]:
         """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one.
 
-        ``only_doubled``: of many states, ``None`` rather than the time of the QZ algorithm."""
+        ``only_doubled``: of many states, ``None`` rather than the time of the QZ algorithm. ``roughly``: the first gain
+        that reaches the rate, not improved."""
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.
@@ -153,6 +157,8 @@ class KalmanProblem:
             gain, change, fast_enough = filtered
             if fast_enough:
                 best = gain + direct
+                if roughly:
+                    break
         return best, change
 
     def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
@@ -164,7 +170,7 @@ class KalmanProblem:
         if not abscissa(moved, self.dt) < bound:
             # Stable in some coordinates and not in others: only rounding tells.
             return np.full(len(direct), np.inf)
-        covariance = noise_covariance(moved, driving, self.estimates @ change, direct, self.dt)
+        covariance = noise_covariance(moved, driving, self.estimates @ change, direct, self.dt, is_stable=True)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
@@ -244,13 +250,19 @@ def compromise(
     again = problem.deviations(plain, start)
     counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
 
-    def attempt(decay: float, *, only_doubled: bool = False) -> tuple[FloatArray, float, float] | None:
-        gain, change = problem.solved(decay, start, only_doubled=only_doubled)
+    many = len(problem.F) >= DOUBLING_FROM
+
+    def attempt(
+        decay: float, *, only_doubled: bool = False, roughly: bool = many
+    ) -> tuple[FloatArray, float, float] | None:
+        gain, change = problem.solved(decay, start, only_doubled=only_doubled, roughly=roughly)
         if gain is None:
             return None
         ratios = problem.deviations(gain, change)[counted] / quietest[counted]
         # None is quieter than the filter without a rate: what is less is rounding in that one.
         price = float(np.max(ratios, initial=1.0))
+        if roughly and abs(price - NOISE_PRICE) <= NEAR_THE_PRICE * NOISE_PRICE:
+            return attempt(decay, only_doubled=only_doubled, roughly=False)
         return (gain, decay, price) if price <= NOISE_PRICE else None
 
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
@@ -258,20 +270,19 @@ def compromise(
     count = 1
     while count < MOST_RATE_HALVINGS and rate * 2.0**-count > slowest:
         count += 1
-    best = fastest_halving(attempt, rate, count, one_by_one=len(problem.F) < DOUBLING_FROM, like=like)
+    best = fastest_halving(attempt, rate, count, one_by_one=not many, like=like)
     if best is None:
         return plain, 0.0, 1.0
-    if best[1] == rate:
-        return best
     low, high = best[1], 2.0 * best[1]
-    while high > RATE_STEP * low:
+    while best[1] < rate and high > RATE_STEP * low:
         middle = float(np.sqrt(low * high))
         trial = attempt(middle)
         if trial is None:
             high = middle
         else:
             best, low = trial, middle
-    return best
+    # Rates are compared by gains that were not improved, which takes half as long; the one that is taken is.
+    return attempt(best[1], roughly=False) or best if many else best
 
 
 def fastest_halving(
