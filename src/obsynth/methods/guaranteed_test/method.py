@@ -19,7 +19,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.error_system import ErrorModel
 
-#: What a bank says of tolerances, and what to do instead.
+#: Note of a bank on tolerances, with the alternative.
 NOMINAL_BANK = (
     "The thresholds are those of the nominal plant: tolerances are not in them. Design each test alone, with its "
     "fault, the others free and this scenario, for thresholds over them."
@@ -30,80 +30,80 @@ NOMINAL_BANK = (
 class GuaranteedTestMethod(TestOptions, Method):
     r"""Design the test of a fault on the last samples that has the least threshold without false alarms.
 
-    The residual is a weighted sum of the last outputs and known inputs.  While disturbances and noise keep their bounds
-    it never passes the threshold without the fault, and no function of these samples does better: a course of the fault
-    of twice that size gives the same samples as none, and the design ships it.
+    The residual is a weighted sum of the last outputs and known inputs.  Without the fault it never exceeds the
+    threshold, as long as disturbances and noise keep their bounds.  No function of these samples does better: the
+    design contains a fault profile of twice the size that gives the same samples as no fault.
 
     Parameters
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         Discrete time (``transform: sample_time``), any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``D``,
-        ``Df``, ``Dd``, ``Bw``, ``Dw`` allowed.  Of one that changes with k each row has a test of its own, and
-        parameters are faults: that of k acts on the way to sample k + 1.  ``mu1``, ``mu2``, ... are its disturbances,
-        one in each equation; what is claimed is of the worst row that has a test, and ``limits`` tells each.
+        ``Df``, ``Dd``, ``Bw``, ``Dw`` are allowed.  A time-varying plant has a separate test for each row.  Its
+        parameters are faults; the value at k acts on the step to sample k + 1.  Its disturbances are ``mu1``, ``mu2``,
+        ..., one in each equation.  Claims are for the worst row with a test, and ``limits`` has those of each row.
     fault : str, optional
-        The fault that is looked for; may be left out where there is one only.
+        The fault to be detected; may be left out if there is only one.
     samples : int or "auto", optional
-        Samples of the window.  By default the least number whose threshold is within 5 % of that of the longest window
-        tried; the numbers are in the design's certificate as ``trade_off``.
+        Number of samples in the window.  By default the least number with a threshold within 5 % of that of the longest
+        window tried; the certificate has all of them as ``trade_off``.
     course : {"step", "constant", "any", "ramp", "rate"}, optional
-        What the fault does.  ``step``: nothing for ``before`` samples, then it is constant (residuals fade once it
-        fills the window: latch alarms).  ``constant``: over the whole window.  ``any``: whatever it likes; it is
-        estimated for one sample, ``lag`` samples back.  ``ramp``: a straight line.  ``rate``: at most ``fault_rate``
-        a sample.
+        Profile of the fault.  ``step``: zero for ``before`` samples, then constant (residuals fade once the step fills
+        the window, so latch alarms).  ``constant``: over the whole window.  ``any``: arbitrary; the fault is estimated
+        for one sample, ``lag`` samples back.  ``ramp``: a straight line.  ``rate``: changes of at most ``fault_rate``
+        per sample.
     lag : int, optional, samples
-        Of which sample before the last the fault is estimated (``any``, ``ramp``, ``rate``); for ``any`` by default
-        the least for which there is a test, otherwise 0.
+        The fault is estimated for the sample this many before the last one (``any``, ``ramp``, ``rate``).  By default
+        0; for ``any`` the least for which there is a test.
     before, after : int, optional, samples
-        Of a step: healthy samples before it, and samples from it on, which is another way to say ``samples``.
+        For a step: number of healthy samples before it, and of samples from it on, in place of ``samples``.
     disturbance_bounds : float or mapping of str to float or [low, high]
-        Largest absolute value of every disturbance, or by name the interval in which it stays: its middle is then a
-        known constant, and half its width counts.
+        Largest absolute value of every disturbance, or its interval by name; the middle of an interval is then a known
+        constant, and half its width is the bound.
     noise_bound : float or mapping of str to float or [low, high]
-        Deviations that no component of the stated noise exceeds; or, by output, the bound or the interval of its noise
-        (plants that change with k: always by output).
+        Number of standard deviations that no component of the stated noise exceeds; or, by output, the bound or the
+        interval of its noise (for time-varying plants always by output).
     disturbance : {"any", "jump", "held", "rate"}, optional
-        How disturbances move within their bounds.  ``any``: as they like, between the samples of a plant that was
-        sampled from a continuous one too; ``jump``: at will from sample to sample, held in between; ``held``: not at
-        all over the window; ``rate``: by ``disturbance_rate``.  Whatever is not ``any`` is an assumption, which every
-        sentence repeats.  Of a plant that is given in discrete time, or that has delays, ``any`` is ``jump``.
+        Profile of the disturbances within their bounds.  ``any``: arbitrary, for a sampled continuous plant also
+        between samples; ``jump``: arbitrary from sample to sample, held in between; ``held``: constant over the window;
+        ``rate``: changes by at most ``disturbance_rate``.  Every value but ``any`` is an assumption, which all results
+        repeat.  For a plant given in discrete time, or with delays, ``any`` is ``jump``.
     disturbance_rate : float or mapping of str to float, optional
         Largest change of each disturbance within the time of a sample.
     fault_rate : float, optional
         Largest change of the fault from sample to sample.
     state_bounds, initial_bounds : mapping of str to float, optional
-        Largest absolute value of states, at every sample or at the first of the window; none by default.  With
-        ``state_bounds`` what is claimed as ``least`` is about intervals: a fault of that size and its opposite give the
-        same samples.  Twice it need not look like none, as the states may have no such course within their bounds.
+        Largest absolute values of states, at every sample or at the first one of the window; none by default.  With
+        ``state_bounds`` the claim ``least`` is about intervals: a fault of that size and the opposite one give the same
+        samples.  A fault of twice that size need not look like none, since the states may leave their bounds.
     free : "others", "none" or sequence of str, optional
-        Faults that may do anything besides: the test is blind to them, so that its alarm isolates.
+        Faults that the test is decoupled from, so that an alarm isolates its fault.
     free_course : {"any", "constant"}, optional
-        What these do.
+        Profile of these faults.
     norm : {"box", "ellipsoid"}, optional
-        Whether each component has its bound, or disturbances and noise of a sample lie in ellipsoids with these half
-        axes.
+        Whether each component has its own bound, or disturbances and noise of a sample lie in ellipsoids with these
+        half axes.
     scenario : Scenario, optional
-        For plants whose constants have tolerances: what they are expected to do, its faults left out.  An observer of
-        the state then runs beside the test, the threshold over the tolerances follows the signals
-        (``online_monitor(design, constants=plant)``), and weights and samples make its mean over the scenario least.
+        For plants whose constants have tolerances: expected signals, without faults.  An observer of the state then
+        runs beside the test, and the threshold over the tolerances follows the signals
+        (``online_monitor(design, constants=plant)``).  Weights and samples minimise its mean over the scenario.
     isolate : bool, optional
-        A bank: one row for each fault, blind to all others.  Where that is impossible, the alarm of a row means one of
-        the smallest group that can be isolated, which is proved.  Without ``fault`` and ``free``.
+        A bank of tests: one row for each fault, decoupled from all others.  Where that is impossible, an alarm of a row
+        means some fault of the smallest group that can be isolated, which is proved.  Without ``fault`` and ``free``.
     exact : bool, optional
-        On data: the least interval of the fault for the very samples of each row, by two linear programmes, in place
-        of the fixed threshold; each end is proved.  It finds faults that the fixed test does not.  Where no course of
-        the fault explains a window, such as that in which it begins, there is an alarm and no interval.
+        On data: in place of the fixed threshold, the least interval of the fault that the samples of each row allow, by
+        two linear programmes with proved ends.  It detects faults that the fixed test does not.  If no fault profile
+        explains a window, such as the one in which the fault begins, there is an alarm without an interval.
     missing : {"wait", "solve"}, optional
-        On data, after a missing sample: no verdict until the window is complete again, or that of the least threshold
-        without the rows that are missing, solved and proved for each window.
+        On data, after a missing sample: no result until the window is complete again, or the test of least threshold
+        without the missing rows, solved and proved for each window.
     region : mapping of str to [low, high], optional
-        Of a nonlinear plant, in units: where each state, input, fault and unknown input stays, between samples too.
-        What its linear model leaves out there is bounded and counts as a disturbance, so that ``threshold`` holds for
-        the nonlinear plant in this region; ``least`` is not claimed.
+        For a nonlinear plant: ranges, in units, of each state, input, fault and unknown input, also between samples.
+        The error of the linear model in this region is bounded and counts as a disturbance, so that ``threshold`` holds
+        for the nonlinear plant; ``least`` is not claimed.
     sample_time : float, optional, seconds
-        Of a nonlinear plant: between samples.
+        For a nonlinear plant: the time between samples.
     given : mapping of str to float, optional
-        Of a nonlinear plant: what is known of the equilibrium at which it is linearised, as `linearise` takes it.
+        For a nonlinear plant: known values at the equilibrium at which it is linearised, as for `linearise`.
     model : mapping, optional
         In the options of a finished design: the nonlinear plant.  Leave it out.
     name : str, optional
