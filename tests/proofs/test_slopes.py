@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.expressions import parse_expression
+from obsynth.proofs import slopes
 from obsynth.proofs.slopes import slope_over
 
 _EXPRESSIONS = [
@@ -67,3 +69,19 @@ def test_monotone_slopes_are_exact_to_rounding() -> None:
 def test_slopes_that_are_not_bounded_are_refused(text: str, told: str) -> None:
     with pytest.raises(PreconditionError, match=told):
         slope_over(parse_expression(text), "s", {"s": (0.0, 1.0)})
+
+
+def test_a_slope_over_one_box_is_enclosed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quotient with three arguments takes a second: existence, design and verification each ask for it."""
+    boxes: list[object] = []
+    enclosed = slopes.enclosed_range
+
+    def counted(enclosure: Any, value: Any, box: Any) -> Any:
+        boxes.append(box)
+        return enclosed(enclosure, value, box)
+
+    monkeypatch.setattr(slopes, "enclosed_range", counted)
+    text = "(a * sin(s) - 0.123 * cos(s)) / (1 + 0.2 * s ** 2)"
+    found = [slope_over(parse_expression(text), "s", {"s": (-0.5, high), "a": (1.0, 2.0)}) for high in (0.5, 0.5, 0.75)]
+    assert boxes == [[(1.0, 2.0), (-0.5, 0.5)], [(1.0, 2.0), (-0.5, 0.75)]]
+    assert found[0] == found[1] != found[2]

@@ -51,6 +51,8 @@ class Interval:
         """Return the interval with ends moved outward by what so many roundings may have cost."""
         if not (math.isfinite(low) and math.isfinite(high)):
             raise _unbounded("it is not finite everywhere")
+        if roundings == 1.0:
+            return cls(math.nextafter(low, -math.inf), math.nextafter(high, math.inf))
         for _ in range(int(roundings)):
             low, high = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
         return cls(low, high)
@@ -86,19 +88,19 @@ class Interval:
         for interval, constant in ((self, factor), (factor, self)):
             if constant.is_point and constant.low in (1.0, -1.0):
                 return interval if constant.low > 0.0 else -interval
-        pairs = [(x, y) for x in (self.low, self.high) for y in (factor.low, factor.high)]
         # A product with zero is exact; one of small numbers may be rounded to zero.
-        products = [Interval(0.0, 0.0) if x == 0.0 or y == 0.0 else Interval.outward(x * y, x * y) for x, y in pairs]
-        return Interval(min(product.low for product in products), max(product.high for product in products))
+        return _hull_of_rounded(
+            [None if x == 0.0 or y == 0.0 else x * y for x in (self.low, self.high) for y in (factor.low, factor.high)]
+        )
 
     def __truediv__(self, other: Any) -> Interval:
         """Return all quotients; refused where the divisor can be zero."""
         divisor = Interval.of(other)
         if divisor.low <= 0.0 <= divisor.high:
             raise _unbounded(f"a divisor lies between {divisor.low:.4g} and {divisor.high:.4g} and can be zero")
-        pairs = [(x, y) for x in (self.low, self.high) for y in (divisor.low, divisor.high)]
-        quotients = [Interval(0.0, 0.0) if x == 0.0 else Interval.outward(x / y, x / y) for x, y in pairs]
-        return Interval(min(quotient.low for quotient in quotients), max(quotient.high for quotient in quotients))
+        return _hull_of_rounded(
+            [None if x == 0.0 else x / y for x in (self.low, self.high) for y in (divisor.low, divisor.high)]
+        )
 
     def __pow__(self, other: Any) -> Interval:
         """Return all powers."""
@@ -128,6 +130,15 @@ class Interval:
             power = Interval.outward(least, max(low, high), FUNCTION_ROUNDINGS)
             return Interval(max(power.low, 0.0), power.high)
         return Interval.outward(low, high, FUNCTION_ROUNDINGS)
+
+
+def _hull_of_rounded(values: Sequence[float | None]) -> Interval:
+    """Return the interval that holds what each value was rounded from; `None` is an exact zero."""
+    rounded = [value for value in values if value is not None]
+    if not rounded:
+        return Interval(0.0, 0.0)
+    hull = Interval.outward(min(rounded), max(rounded))
+    return hull if len(rounded) == len(values) else Interval(min(hull.low, 0.0), max(hull.high, 0.0))
 
 
 @dataclass(frozen=True)

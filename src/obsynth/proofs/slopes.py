@@ -10,13 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.expressions import Expression, step_function
+from obsynth.numerics.expressions import Expression, parse_expression, step_function
 from obsynth.proofs.intervals import Interval, Range, enclosed_range, interval_operation
+
+#: So many ranges of slopes are kept: the largest plants have 64 slopes.
+MOST_KEPT = 256
 
 _ONE, _ZERO = Interval(1.0, 1.0), Interval(0.0, 0.0)
 
@@ -61,7 +65,14 @@ def slope_over(expression: Expression, name: str, box: Mapping[str, tuple[float,
     (0.791, 3.536)
     """
     names = sorted(expression.names)
-    ends = [(float(box[each][0]), float(box[each][1])) for each in names]
+    return _slope_over(expression.text, name, tuple((each, float(box[each][0]), float(box[each][1])) for each in names))
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _slope_over(text: str, name: str, box: tuple[tuple[str, float, float], ...]) -> Range:
+    # Existence, design and verification ask for the same slopes; of three arguments one takes seconds.
+    expression, names = parse_expression(text), [each for each, _, _ in box]
+    ends = [(low, high) for _, low, high in box]
 
     def enclosure(part: tuple[tuple[float, float], ...]) -> Interval:
         values = {
