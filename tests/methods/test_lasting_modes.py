@@ -207,9 +207,10 @@ def test_the_least_gain_of_filters_whose_errors_decay_is_printed_beside_a_mode_t
     printed = float(re.search(r"decay after any start is about ([\d.]+) ", design.notes[-1])[1])
     driven = plant.replace(Bw=np.hstack([np.zeros((2, 3)), [[1e-4], [0.0]]]), Dw=np.eye(3, 4), noise_names=[*"abcd"])
     limit = obsynth.optimal_filter(driven, **options)
-    assert printed == pytest.approx(limit.least, rel=2e-6)
+    # Six digits are printed.
+    assert printed == pytest.approx(limit.least, rel=5e-6)
     assert design.least < 0.9 * printed
-    assert printed * (1 - 2e-6) <= design.gain <= 1.001 * printed
+    assert printed * (1 - 5e-6) <= design.gain <= 1.001 * printed
 
 
 @pytest.mark.long
