@@ -167,3 +167,16 @@ def test_notes_of_a_file_are_said_to_be_unverified(tmp_path: Path, capsys: pytes
         assert "is certain to raise" in notes
     assert main(["report", "--gains", str(file), "--out", str(page)]) == 0
     assert page.read_text().count("is certain to raise") == page.read_text().count("which verify does not check") == 1
+
+
+def test_checks_are_counted_alike_in_every_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The header of the C code counted rows that only inform: 44 checks, where `verify` has 30."""
+    plant = obsynth.load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
+    design = obsynth.fault_estimation_filter(plant, weight="paper")
+    design.save(folder / "right.gains.json")
+    assert main(["verify", "--gains", "right.gains.json"]) == 0
+    told = re.search(r"Verified: all (\d+) checks hold", capsys.readouterr().out)
+    assert told is not None
+    assert int(told.group(1)) < len(design.report.checks)
+    assert main(["export", "--gains", "right.gains.json", "--to", "right.c"]) == 0
+    assert f"Verified: all {told.group(1)} checks of obsynth hold." in (folder / "right.h").read_text()

@@ -23,6 +23,7 @@ from obsynth.observers.recursive.steady_observer import steady_observer
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import with_verdict
 from obsynth.results.design import ObserverDesign, unverified_mark
 from obsynth.results.gain_set_writing import gain_set_digest
 
@@ -196,7 +197,7 @@ class Realisation:
 def verification_words(design: ObserverDesign) -> str:
     """Return the status of a design's verification, in a sentence."""
     mark = unverified_mark(design.report)
-    return mark or f"Verified: all {len(design.report.checks)} checks of obsynth hold."
+    return mark or f"Verified: all {len(with_verdict(design.report.checks))} checks of obsynth hold."
 
 
 def _constant_plant(plant: Any) -> DescriptorSystem | None:

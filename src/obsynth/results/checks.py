@@ -139,7 +139,12 @@ def information(
     )
 
 
+def with_verdict(checks: Sequence[Check]) -> list[Check]:
+    """Return the checks that hold or fail: those that are counted; rows that inform are none."""
+    return [check for check in checks if check.kind != "information"]
+
+
 def all_hold(checks: Sequence[Check]) -> bool:
     """Whether there is at least one check besides information, and all of these pass."""
-    verdicts = [check.passed for check in checks if check.kind != "information"]
+    verdicts = [check.passed for check in with_verdict(checks)]
     return bool(verdicts) and all(verdicts)

@@ -19,7 +19,7 @@ from rich.text import Text
 from obsynth.files.tables import aligned
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.outward import lower, upper
-from obsynth.results.checks import OPEN_LOOP, Check, all_hold
+from obsynth.results.checks import OPEN_LOOP, Check, all_hold, with_verdict
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
 SAME_NUMBER = 1e-9
@@ -257,7 +257,7 @@ def verdict(check: Check) -> Text:
 
 def verdict_line(checks: Sequence[Check]) -> Text:
     """Return one line that says whether a whole report holds, and what fails; first, what it is not about."""
-    real = [check for check in checks if check.kind != "information"]
+    real = with_verdict(checks)
     if all_hold(checks):
         opens = any(check.name == OPEN_LOOP for check in checks)
         about = "An open-loop model, of whose stability nothing is claimed. " if opens else ""

@@ -18,7 +18,7 @@ from obsynth.monitoring.alarms.proving import rows_of
 from obsynth.numerics.arguments import arguments_checked, is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.certificate_files import ALARM_KIND, SHOWN_DIGITS, opened
-from obsynth.results.checks import Check, information
+from obsynth.results.checks import Check, information, with_verdict
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import restored
 from obsynth.results.gain_sets import loaded
@@ -128,9 +128,10 @@ def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") ->
     """Return the row on a gain set inside a certificate, verified like any other."""
     report = verify(design)
     failing = ", ".join(check.name for check in report.failures)
+    count = len(with_verdict(report.checks))
     return _row(
         name,
-        f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: {len(report.checks)} checks",
+        f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: {count} checks",
         float(len(report.failures)),
         0.0,
         report.passed,
