@@ -88,3 +88,10 @@ def test_units_of_the_outputs_change_no_covariance(decades: float) -> None:
     found = continuous_solution(a, units[:, None] * c, process, np.diag(units**2), cross * units)
     assert expected is not None
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_an_equation_that_is_nearly_singular_warns_no_user() -> None:
+    # SciPy perturbs it, and says so: designs and comparisons of random plants printed that warning.
+    a = np.diag([1.0, -1.0 - 1e-16])
+    assert continuous_lyapunov(a, -np.ones((2, 2))).shape == (2, 2)
+    assert discrete_lyapunov(np.diag([1.0 - 1e-16, 0.5]), np.eye(2), method="bilinear").shape == (2, 2)

@@ -66,7 +66,10 @@ def discrete_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray,
 
 def _by_rows(solve: Callable[..., Any], *matrices: FloatArray, **others: FloatArray | None) -> FloatArray:
     options = {name: None if matrix is None else np.ascontiguousarray(matrix) for name, matrix in others.items()}
-    return np.asarray(solve(*map(np.ascontiguousarray, matrices), **options))
+    # SciPy warns of equations that are nearly singular: a user of obsynth can do nothing about it, and whoever asked
+    # for the solution judges it.
+    with warnings.catch_warnings(action="ignore"):
+        return np.asarray(solve(*map(np.ascontiguousarray, matrices), **options))
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
