@@ -120,10 +120,17 @@ def _gain_rows(
         yield from listed_gains_row(gains, dict.fromkeys((*_SAME_EVERYWHERE, *own), ()), tuple)
         return
     same = {letter: gains[letter] for letter in _SAME_EVERYWHERE}
+    letters = frozenset({*same, "K_a"})
     yield from worst_of_vertices(
         (
             gain_rows(
-                {**same, "K_a": gains[letter]}, vertex, observer.at_vertex(place), model, tracking, EQUALITY_TOLERANCE
+                {**same, "K_a": gains[letter]},
+                vertex,
+                observer.at_vertex(place),
+                model,
+                tracking,
+                EQUALITY_TOLERANCE,
+                letters=letters,
             )
             for place, (letter, vertex) in enumerate(zip(own, plant.vertices, strict=True))
         ),

@@ -144,12 +144,18 @@ def gain_rows(
     model: Exosystem,
     tracking: FloatArray,
     tolerance: float,
+    *,
+    letters: frozenset[str] | None = None,
 ) -> Iterator[Check]:
-    """Yield the row on the listed gains; nothing where none are listed, as the realisation stands for itself."""
+    """Yield the row on the listed gains; nothing where none are listed, as the realisation stands for itself.
+
+    ``letters`` are those that have to be listed: by default all of an observer of a linear plant.
+    """
     if not gains:
         return
     shapes, residuals = _shapes(plant, observer, model), []
     expected = set(shapes) if set(gains) & LETTERS_OF_PARTS else set(shapes) - LETTERS_OF_PARTS
+    expected = expected if letters is None else set(letters)
     wrong = sorted(set(gains) ^ expected)
     for letter, shape in shapes.items():
         if letter in gains and (gains[letter].shape != shape or not np.all(np.isfinite(gains[letter]))):
