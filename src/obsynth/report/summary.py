@@ -52,6 +52,9 @@ from obsynth.verification.constant_faults import CONSTANT_FAULT
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
 
+#: What an observer over a region that steps from row to row by implicit Euler needs besides.
+_CLOSE_ROWS = "rows that are close beside its motion"
+
 #: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more is not separated from
 #: the fault.
 UNSEPARATED_GAIN = 0.5
@@ -308,9 +311,10 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
     elif isinstance(design.observer, RegionObserver):
-        yield f"the model is exact, with {design.observer.operating_region.sentence()}"
+        yield f"the model is exact, with {design.observer.operating_region.sentence()}; {_CLOSE_ROWS}"
     elif isinstance(design.plant, PolytopicSystem):
-        yield "the model is exact, with the scheduling parameters measured and in their region"
+        close = "" if design.plant.is_discrete else f"; {_CLOSE_ROWS}"
+        yield f"the model is exact, with the scheduling parameters measured and in their region{close}"
     else:
         chosen = next(filter(None, map(_IDENTITY_NOTE.match, design.notes)), None)
         names = "" if chosen is None else " = ".join(chosen.group(1).split(" and "))

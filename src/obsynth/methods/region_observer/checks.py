@@ -152,7 +152,10 @@ def _proved_rows(
     claims = design.certificate.claims
     witness, of_level = (_witness(design, terms, names) for names in (WITNESSES, GAIN_WITNESSES))
     vertices = corner_errors(terms, region.slopes(), observer.slopes, observer.gain, drive)
-    words = f"while the plant is in {region.sentence()}, for every trajectory there"
+    words = (
+        f"while the plant is in {region.sentence()}, for every trajectory there (what a step of implicit Euler misses "
+        "of it is not counted)"
+    )
     rate = claimed(claims, "region_decay")
     decay = decay_row(vertices, witness, rate, discrete=False, words=words)
     yield decay

@@ -93,7 +93,9 @@ class RegionObserverMethod(Method):
     -----
     Nonlinearities are continued beyond their box with a slope between their bounds, so that the mean value theorem
     holds for any estimate while the plant is inside. White noise: the bound holds in continuous time, and for the
-    samples of implicit Euler of any step (the noise of a sample enters the step itself). A row in which an input, a
+    samples of implicit Euler of any step (the noise of a sample enters the step itself). What a step of implicit Euler
+    misses of the motion of a plant is in no claim: of a van der Pol oscillator whose deviation is claimed below 0.0309
+    it was 0.058 in steps of 0.01 s, and 0.026 in steps of 0.00125 s. A row in which an input, a
     measured combination or the estimate leaves the region is ``out``, and so are those after it until a hundredth
     of the error is left. That a state which is neither is inside is assumed.
 

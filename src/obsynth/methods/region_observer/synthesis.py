@@ -367,9 +367,9 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
             "have settled it is an assumption."
         )
     notes.append(
-        "The observer takes steps of implicit Euler, for which the same certificate is proved; what such a step misses "
-        "of the plant's own motion acts as a disturbance. Samples that are close beside the plant's time constants "
-        "keep it small."
+        "The observer takes steps of implicit Euler, for which the same certificate is proved. The claims do not count "
+        "what such a step misses of the plant's own motion: try a shorter sample_time, and simulate, where samples are "
+        "not close beside it."
     )
     return notes
 

@@ -286,8 +286,8 @@ def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -
     if not plant.is_discrete:
         notes.append(
             "Between the rows of a log the observer takes a step of implicit Euler, along which errors decay in the "
-            "norm of the same certificate however long the step is; what such a step misses of the plant's own motion "
-            "acts as a disturbance. Rows that are close beside the plant's time constants keep it small."
+            "norm of the same certificate however long the step is. The claims do not count what such a step misses of "
+            "the plant's own motion, which is little where rows are close beside it."
         )
     if plant.nf:
         notes.append(
