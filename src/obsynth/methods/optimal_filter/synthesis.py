@@ -182,7 +182,8 @@ def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Sy
 
 def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis:
     """Return the filter for the largest noise on modes that last of which less does not lower the gain."""
-    best, least_gain, fault_map = None, math.inf, None
+    found: list[tuple[Synthesis, FaultMap]] = []
+    least_gain = math.inf
     for drive in ADDED_DRIVES:
         driven = with_lasting_modes_driven(plant, drive)
         try:
@@ -190,18 +191,17 @@ def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -
             made = _made(plant, options, curve, chosen, searched=driven)
         except (PreconditionError, SolverError):
             # With less noise rounding may spoil the proof; the filter for more of it is proved already.
-            if best is None:
+            if not found:
                 raise
             break
         gain, least = made.certificate.claims["gain"], made.certificate.claims.get("least", 0.0)
-        if best is not None and gain >= least_gain * (1.0 - CLOSED_GAP):
+        if found and gain >= least_gain * (1.0 - CLOSED_GAP):
             break
-        best, least_gain, fault_map = made, gain, chosen.fault_map
+        found.append((made, chosen.fault_map))
+        least_gain = gain
         if chosen.is_nothing or gain - least <= CLOSED_GAP * gain:
             return made
-    assert best is not None
-    assert fault_map is not None
-    return _with_least_of_every_start(plant, options, best, fault_map)
+    return _with_least_of_every_start(plant, options, *found[-1])
 
 
 def _with_least_of_every_start(
