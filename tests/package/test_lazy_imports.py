@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 HEAVY = (
-    "casadi", "control", "cvxpy", "flint", "matplotlib", "numba", "pandas", "pyarrow", "pydantic", "scipy.linalg",
-    "slycot",
+    "casadi", "control", "cvxpy", "flint", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "pydantic",
+    "scipy.linalg", "slycot",
 )  # fmt: skip
 SOURCE = Path(__file__).parents[2] / "src"
 
@@ -73,7 +73,7 @@ def test_a_short_record_is_run_without_numba() -> None:
 
 def test_the_help_was_really_run() -> None:
     """The probe above sees modules that are loaded, and the programs do end in their help."""
-    assert loaded_modules("import scipy.linalg", HEAVY) == "LOADED ['scipy.linalg']"
+    assert loaded_modules("import scipy.linalg", HEAVY) == "LOADED ['numpy', 'scipy.linalg']"
     assert (
         loaded_modules(DESIGN_HELP + RUN, ("obsynth.cli.main", "argparse")) == "LOADED ['obsynth.cli.main', 'argparse']"
     )

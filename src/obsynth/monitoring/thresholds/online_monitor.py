@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
+from obsynth.monitoring.thresholds.checked_options import checked_options
 from obsynth.monitoring.thresholds.continuous_region_bounds import continuous_region_bound
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, gap_growth
 from obsynth.monitoring.thresholds.guaranteed import data_monitor
@@ -19,7 +20,7 @@ from obsynth.monitoring.thresholds.learned import LearnedThresholds, load_thresh
 from obsynth.monitoring.thresholds.learned_rule import learned_monitor
 from obsynth.monitoring.thresholds.learning import learn_thresholds
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, STATEMENTS, Monitor, Rule, statement_of
-from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS
 from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.region_bounds import region_bound
 from obsynth.monitoring.thresholds.residual_model import (

@@ -12,9 +12,10 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
+from obsynth.monitoring.thresholds.checked_options import checked_options
 from obsynth.monitoring.thresholds.guaranteed import record_monitor
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
-from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.residual_norm_bounds import (
     norms_of_windows,
