@@ -50,7 +50,6 @@ _PUBLIC_NAMES = {
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.optimal_filter.public": "OptimalFilter optimal_filter",
     "methods.pd_observer.public": "apply_adaptation_gain",
-    "methods.ui_pi_observer.fault_response": "fault_response",
     "methods.verifying": "verify",
     "monitoring.alarms.certificates": "verify_alarm",
     "monitoring.alarms.proving": "prove_alarm",
@@ -108,6 +107,7 @@ _PUBLIC_NAMES = {
     "studies.sensor_sets": "sensor_sets",
     "studies.sweep": "sweep",
     "studies.tolerance_study": "tolerance_study",
+    "verification.output_responses": "fault_response",
 }
 _PUBLIC_HOMES = {name: f"obsynth.{module}" for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 #: Modules whose names are used through them, such as ``obsynth.plotting.plot_data``.

@@ -30,7 +30,6 @@ from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed
 from obsynth.methods.optimal_filter.public import OptimalFilter as OptimalFilter
 from obsynth.methods.optimal_filter.public import optimal_filter as optimal_filter
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
-from obsynth.methods.ui_pi_observer.fault_response import fault_response as fault_response
 from obsynth.methods.verifying import verify as verify
 from obsynth.monitoring.alarms.certificates import verify_alarm as verify_alarm
 from obsynth.monitoring.alarms.proving import prove_alarm as prove_alarm
@@ -104,6 +103,7 @@ from obsynth.studies.robustness import robustness as robustness
 from obsynth.studies.sensor_sets import sensor_sets as sensor_sets
 from obsynth.studies.sweep import sweep as sweep
 from obsynth.studies.tolerance_study import tolerance_study as tolerance_study
+from obsynth.verification.output_responses import fault_response as fault_response
 from obsynth.version import __version__ as __version__
 
 __all__: list[str]

@@ -75,6 +75,29 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "uncertainty": (lambda: plant(uncertainty=3), "uncertainty is an int"),
     "parts of uncertainty": (lambda: plant(uncertainty={}), "uncertainty has no 'box'"),
     "exact": (lambda: plant(exact=np.eye(2)), "exact is a ndarray"),
+    "an array without axes": (lambda: obsynth.decouple(plant(**FAULTY), without=np.array(1.0)), "without is a ndarray"),
+    "an array for a log": (
+        lambda: obsynth.run_on_data(obsynth.functional_filter(plant(**FAULTY)), np.zeros((5, 2))),
+        "data is an array, whose columns have no names",
+    ),
+    "an empty array for a scenario": (
+        lambda: obsynth.guaranteed_test(plant(**FAULTY), scenario=np.array([])), "scenario is for plants whose constants",
+    ),
+    "a first state that is a text": (
+        lambda: obsynth.descriptor_kalman(plant(**FAULTY), initial_state=""), "initial_state is '': give real numbers",
+    ),
+    "a first variance below 0": (
+        lambda: obsynth.descriptor_kalman(plant(**FAULTY), initial_covariance=-1.0),
+        "initial_covariance is no covariance",
+    ),
+    "rows of different lengths": (
+        lambda: obsynth.descriptor_kalman(plant(**FAULTY), Q=[[1, 2], [3]]), "Q has rows of different lengths",
+    ),
+    "a function of nothing": (
+        lambda: obsynth.fault_estimation_filter(plant(**FAULTY), constraints=lambda: []),
+        "constraints is a function that does not take one argument",
+    ),
+    "an array for a plant": (lambda: obsynth.PolytopicSystem(plant=np.array([])), "plant is a ndarray"),
     "parts of exact": (lambda: plant(exact={}), "exact has no 'matrices'"),
     "definitions": (lambda: obsynth.DAEModel(**MODEL, definitions=np.eye(2)), "definitions"),
     "state": (lambda: LINEAR.step(None, [1.0]), "state is missing"),
@@ -130,6 +153,16 @@ def test_values_that_ended_in_errors_of_others_are_refused_by_name(what):
 def test_names_of_outputs_may_be_an_array_beside_noise_by_name():
     named = plant(output_names=np.array(["a", "b"]), sensor_noise={"a": 0.1, "b": 0.2})
     assert (named.output_names, named.noise_names) == (("a", "b"), ("noise a", "noise b"))
+
+
+def test_small_numbers_of_numpy_do_not_overflow():
+    """Whole numbers of eight bits end at 127, also in products."""
+    continuous = obsynth.DescriptorSystem(A=-np.eye(2), C=np.eye(2), **FAULTY)
+    by_numpy, plain = (
+        obsynth.compare(continuous, sample_time=time, methods=["functional-filter"], runs=2)
+        for time in (np.int8(1), 1.0)
+    )
+    np.testing.assert_array_equal(by_numpy.truth, plain.truth)
 
 
 def test_arguments_of_the_right_kind_are_not_judged_by_their_class():

@@ -17,8 +17,9 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.ui_pi_observer.fault_response import fault_response
+from obsynth.methods.ui_pi_observer.unmodelled_faults import tracking_response
 from obsynth.methods.verifying import verify
+from obsynth.numerics.spectra import boundary_points
 from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
 from obsynth.results.verification_report import VerificationReport
@@ -301,7 +302,9 @@ def test_a_plant_that_is_not_regular_has_its_page_and_its_gains(dt: float, tmp_p
         found = estimate_gains(design, to=to)
         # The same by the way of the verification, which asks for no state of the plant.
         if to == "faults":
-            expected = np.abs(fault_response(design, found.frequencies)[:, 0, 0])
+            tracking = design.certificate.matrices["tracking"]
+            points = boundary_points(found.frequencies, dt)
+            expected = np.abs(tracking_response(*design.linear, tracking, points)[:, 0, 0])
             np.testing.assert_allclose(found.gains["faults"], expected, rtol=1e-6, atol=1e-9)
         else:
             assert np.all(np.isfinite(found.gains["faults"]))

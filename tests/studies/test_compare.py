@@ -253,7 +253,7 @@ def test_the_page_lists_meanings_and_refusals_and_names_units(bicycle: obsynth.C
     for refusal in bicycle.refusals:
         assert f"<li>{html.escape(refusal)}</li>" in page
         assert "..." not in refusal
-    assert "<li>s to alarm: median detection delay</li>" in page
+    assert "<li>s to alarm: median detection delay; never: not within the run</li>" in page
 
 
 def test_a_plant_that_settles_over_thousands_of_samples_needs_no_scenario():

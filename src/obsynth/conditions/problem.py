@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from inspect import signature
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -335,12 +336,13 @@ class Conditions:
                 path="drop",
             )
         remaining = {key: value for key, value in self.constraints.items() if key not in set(drop)}
-        added = constraints(self.letters()) if callable(constraints) else constraints
+        added = of_the_letters(constraints, self.letters(), "constraints") if callable(constraints) else constraints
         new = named_constraints(added, sum(name.startswith(OWN) for name in remaining))
         remaining |= new
         goal = self.problem.objective
         if objective is not None:
-            goal = checked_objective(objective(self.letters()) if callable(objective) else objective)
+            given = of_the_letters(objective, self.letters(), "objective") if callable(objective) else objective
+            goal = checked_objective(given)
         return replace(
             self,
             problem=lmi.semidefinite_problem(goal, list(remaining.values())),
@@ -421,6 +423,21 @@ class Letters(dict[str, Any]):
 def _called(name: str) -> str:
     """Return how a message calls a constraint of the user."""
     return f"your constraint {name.removeprefix(OWN)}" if name.startswith(OWN) else f"the constraint {name!r}"
+
+
+def of_the_letters(function: Callable[..., Any], letters: Mapping[str, Any], name: str) -> Any:
+    """Return what a user's function makes of the letters; raise `SpecError` where it does not take them."""
+    try:
+        signature(function).bind(letters)
+    except TypeError:
+        raise SpecError(
+            f"{name} is a function that does not take one argument: it is called with the letters of the problem, as "
+            f"{name}=lambda letters: {'...' if name == 'objective' else '[...]'}.",
+            path=name,
+        ) from None
+    except ValueError:
+        pass  # a function of another language tells no arguments
+    return function(letters)
 
 
 def named_constraints(constraints: Any, count: int = 0) -> dict[str, Any]:

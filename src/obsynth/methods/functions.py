@@ -32,7 +32,7 @@ def design_function(
 
     def designed(plant: Any, *values: Any, **options: Any) -> Made:
         own = plant.plant if isinstance(plant, Transformation) else plant
-        if method.over_scenario and options.get("scenario") and getattr(own, "uncertainty", None) is None:
+        if method.over_scenario and options.get("scenario") is not None and getattr(own, "uncertainty", None) is None:
             raise SpecError(
                 "scenario is for plants whose constants have tolerances: it weighs their effects. State tolerances "
                 "(obsynth.uncertain_system), or leave scenario out.",

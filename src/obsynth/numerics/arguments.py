@@ -283,6 +283,7 @@ def _is_one_of(value: Any, kind: Any) -> bool:
         # What can be gone through only once is not looked into, and what has no order may hold names only.
         once = origin is Iterable and isinstance(value, Iterator)
         listed = isinstance(value, Collection) and not isinstance(value, (str, bytes, Mapping))
+        listed = listed and not (isinstance(value, np.ndarray) and value.ndim == 0)
         ordered = inner[0] is str or not isinstance(value, (set, frozenset))
         return once or (listed and ordered and all(_is_one_of(item, inner[0]) for item in value))
     if origin is _Numbers:
@@ -482,8 +483,20 @@ def arguments_worded(**words: str) -> Callable[[Callable[Given, Returned]], Call
                 first = next(iter(wrong))
                 message = wrong[first] if len(wrong) == 1 else f"Arguments of {function.__name__}:"
                 raise SpecError(message, path=first, problems=tuple(wrong.values()) if len(wrong) > 1 else ())
-            return function(*args, **kwargs)
+            given = [_without_numpy(v, kinds.get(name)) for name, v in zip(stated.parameters, args, strict=False)]
+            named = {name: _without_numpy(value, kinds.get(name)) for name, value in kwargs.items()}
+            called_with: Callable[..., Returned] = function
+            return called_with(*given, *args[len(given) :], **named)
 
         return called
 
     return checked
+
+
+def _without_numpy(value: Any, kind: Any) -> Any:
+    """Return a number of numpy as one of Python, whose products do not overflow, and an array for a list as a list."""
+    if isinstance(value, (np.number, np.bool_)):
+        return value.item()
+    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    lists = any(option in (Sequence[str], Sequence[float], Sequence[int]) for option in options)
+    return value.tolist() if isinstance(value, np.ndarray) and lists else value

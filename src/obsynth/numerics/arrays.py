@@ -151,6 +151,11 @@ def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
         raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
 
 
+def dimensions_of(value: Any, name: str) -> int:
+    """Return how many dimensions an array has that a caller gives; raise `SpecError` where it is none."""
+    return as_given(value, name, f"{name} has rows of different lengths: give a full matrix.").ndim
+
+
 def require_readable(entries: float) -> None:
     """Raise `ValueError` for more entries of a file than are read."""
     if entries > MAXIMUM_ENTRIES:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError, a_kind
-from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arguments import is_finite_number, require_mapping, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.convex_hulls import spanning_points
 from obsynth.numerics.expressions import NAMED_NUMBERS, parse_expression
@@ -114,6 +114,7 @@ class PolytopicSystem:
             dense_vertices, held = _from_vertices(vertices, scheduling)
             arguments = {"vertices": [vertex.as_dict() for vertex in dense_vertices], "scheduling": _plain(scheduling)}
         else:
+            require_mapping(plant, "plant")
             numbers = _constants(constants)
             dense_vertices, held, own_shift = _from_expressions(plant or {}, scheduling, numbers, shift)
             arguments = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from obsynth.numerics.arguments import require_shape
+from obsynth.numerics.arguments import real_array, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import covariance_factor
 
 
 def extended_mean(state: Any, nx: int, added: int) -> FloatArray:
     """Return the initial mean of ``nx`` states (zero where none is stated), followed by zeros for the added states."""
-    mean = np.zeros(nx) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
+    mean = np.zeros(nx) if state is None else real_array(state, "initial_state").ravel()
     require_shape(mean.shape, (nx,), "initial_state")
     return np.concatenate([mean, np.zeros(added)])
 
@@ -23,6 +24,7 @@ def stated_covariance(covariance: Any, nx: int) -> FloatArray:
     matrix = np.eye(nx) if covariance is None else as_matrix(covariance, "initial_covariance")
     matrix = matrix[0, 0] * np.eye(nx) if matrix.shape == (1, 1) else matrix
     require_shape(matrix.shape, (nx, nx), "initial_covariance")
+    covariance_factor(matrix, "initial_covariance")  # refuses what is no covariance
     return matrix
 
 

@@ -24,7 +24,7 @@ from obsynth.analysis.existence.recursive import recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, remembered
+from obsynth.numerics.arrays import FloatArray, as_matrix, dimensions_of, remembered
 from obsynth.numerics.ranks import covariance_factor, numerical_rank, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -58,9 +58,10 @@ class WithoutUnknownInputs:
         """Return the covariance of the equations that are left, from that of all: a number or a constant matrix."""
         if self.outputs_alone:
             return np.zeros((1, 1))
-        if np.ndim(covariance) == 0:  # type: ignore[arg-type]
+        dimensions = 3 if callable(covariance) else dimensions_of(covariance, "Q")
+        if dimensions == 0:
             return covariance
-        if callable(covariance) or np.ndim(covariance) != 2:  # type: ignore[arg-type]
+        if dimensions != 2:
             raise SpecError(
                 "Q changes with k, which is not known how to be combined with unknown inputs: give a constant "
                 "covariance.",

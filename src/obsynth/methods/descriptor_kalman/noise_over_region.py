@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_matrix, dimensions_of
 from obsynth.numerics.ranks import covariance_factor, product_but_rounding
 from obsynth.plants.polytopic import PolytopicSystem
 
@@ -77,7 +77,7 @@ def _constant(covariance: Any, size: int, name: str) -> FloatArray | None:
     """Return a covariance as a matrix, checked; ``None`` for the plant's own noise."""
     if covariance is None:
         return None
-    if callable(covariance) or np.ndim(covariance) not in (0, 2) or isinstance(covariance, str):
+    if callable(covariance) or isinstance(covariance, str) or dimensions_of(covariance, name) not in (0, 2):
         raise SpecError(
             f"{name} changes with k, or is no matrix: over a region give a constant covariance ({size} x {size}), or a "
             "number.",

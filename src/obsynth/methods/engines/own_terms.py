@@ -21,7 +21,7 @@ from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
 from obsynth.conditions.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
-from obsynth.conditions.problem import Conditions, named_constraints
+from obsynth.conditions.problem import Conditions, named_constraints, of_the_letters
 from obsynth.conditions.share_pasand import sharepasand
 from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
 from obsynth.errors import PreconditionError, SolverError
@@ -83,7 +83,7 @@ def filter_by_inequality(
         goal, problem = cp.trace(Z), replace(problem, variables={**problem.variables, "Z": Z})
         drop = ("(45)",) if method.gamma is None else ()
     elif method.objective is not None:
-        goal = method.objective(problem.letters())
+        goal = of_the_letters(method.objective, problem.letters(), "objective")
     own = _own_constraints(method, problem)
     problem = problem.changed(constraints={**added, **own}, objective=goal, drop=drop)
     progress("solving the matrix inequality")
@@ -148,7 +148,7 @@ def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: C
     if delta is None:
         delta = _fitting_delta(default_delta(plant if form is None else form.plant, method, decay), where)
     problem = theorem(plant, delta=delta, decay=decay, region=where)
-    goal = None if method.objective is None else method.objective(problem.letters())
+    goal = None if method.objective is None else of_the_letters(method.objective, problem.letters(), "objective")
     own = _own_constraints(method, problem)
     problem = problem.changed(constraints=own, objective=goal)
     progress("solving the matrix inequality")
@@ -173,7 +173,7 @@ def ui_pi_by_inequality(plant: DescriptorSystem, method: UiPiObserver, *, progre
     problem = sharepasand(
         plant, fault_model=method.fault_model, region=where, E_sharp=method.E_sharp, C_sharp=method.C_sharp, G=method.G
     )
-    goal = method.objective(problem.letters()) if callable(method.objective) else None
+    goal = of_the_letters(method.objective, problem.letters(), "objective") if callable(method.objective) else None
     own = _own_constraints(method, problem)
     problem = problem.changed(constraints=own, objective=goal)
     progress("solving the matrix inequality")
@@ -200,7 +200,9 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
 
 def _own_constraints(method: Any, problem: Conditions) -> dict[str, Any]:
     """Return the user's constraints by name."""
-    return {} if method.constraints is None else named_constraints(method.constraints(problem.letters()))
+    if method.constraints is None:
+        return {}
+    return named_constraints(of_the_letters(method.constraints, problem.letters(), "constraints"))
 
 
 def _region_of_poles(method: UiPiObserver, dt: float) -> LMIRegion | None:

@@ -13,9 +13,9 @@ from obsynth.analysis.existence.augmented_pencils import shipped_model
 from obsynth.analysis.existence.sharepasand import existence_conditions
 from obsynth.methods.ui_pi_observer.checks_over_region import checks_over_region
 from obsynth.methods.ui_pi_observer.decoupling import decoupling_norm
-from obsynth.methods.ui_pi_observer.fault_response import tracking_rows
 from obsynth.methods.ui_pi_observer.identities import identities
 from obsynth.methods.ui_pi_observer.number_checks import gain_rows, noise_rows, stability_rows
+from obsynth.methods.ui_pi_observer.unmodelled_faults import tracking_rows
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign

@@ -41,9 +41,15 @@ def log_suffix(path: Path) -> str:
 
 def as_frame(data: Any) -> Any:
     """Return a data frame of a mapping from names to columns, or of a table of another library that can become one
-    (polars, pyarrow); what is neither as it is."""
+    (polars, pyarrow); what is neither as it is.  Raise `SpecError` for an array, whose columns have no names."""
     import pandas as pd
 
+    if isinstance(data, np.ndarray):
+        raise SpecError(
+            "data is an array, whose columns have no names: give a pandas.DataFrame, or columns by name, as "
+            "{'t': ..., 'y1': ...}.",
+            path="data",
+        )
     if isinstance(data, pd.DataFrame):
         return _with_units(data)
     if isinstance(data, Mapping):

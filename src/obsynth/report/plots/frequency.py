@@ -7,21 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.existence.augmented_pencils import equilibrated
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.modal_response import resolved
-from obsynth.numerics.norms import response
 from obsynth.numerics.outward import upper_text
-from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.modes import GRID_REACH, frequency_grid
+from obsynth.observers.linear.modes import GRID_REACH
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.pencil import regularity_of
 from obsynth.report.plots.panels import WIDTH, one_panel, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.output_responses import at_frequencies, output_responses, over_frequencies, sizes_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,18 +95,18 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
     if rows.start == rows.stop:
         what = "estimates no faults" if to == "faults" else f"has no {to}"
         raise SpecError(f"The design {what}.", path="observer")
-    frequencies, points, to_estimate = _over_frequencies(observer, rows)
+    frequencies, points, to_estimate = over_frequencies(observer, rows)
     inputs = {"faults": (plant.Bf, plant.Df), "disturbances": (plant.Bd, plant.Dd), "noise": (plant.Bw, plant.Dw)}
     gains: dict[str, FloatArray] = {}
     least: FloatArray = np.zeros(len(points))
     for name, (b, d) in inputs.items():
         if not b.shape[1]:
             continue
-        states, seen, terms = _responses(plant, b, d, points, to_estimate)
+        states, seen, terms = output_responses(plant, b, d, points, to_estimate)
         if to == "states":
             own = [plant.state_names.index(name) for name in observer.state_names]
             truth = _delayed(observer, points) * states[:, own]
-            seen, terms = seen - truth, terms + _sizes(truth)
+            seen, terms = seen - truth, terms + sizes_of(truth)
         values = _above_rounding(np.linalg.svd(seen, compute_uv=False), terms[:, None])
         gains[name] = values[:, 0]
         if name == "faults":
@@ -130,7 +125,7 @@ class FaultGains:
 def fault_gains(design: ObserverDesign) -> FaultGains:
     """Return what reaches each fault estimate of a linear design that estimates faults."""
     plant, observer = design.linear
-    frequencies, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
+    frequencies, points, to_estimate = over_frequencies(observer, observer.fault_rows)
     disturbance_gains = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
         coarse = _disturbance_gains(plant, points, to_estimate)
@@ -139,41 +134,18 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
         sides = np.concatenate([frequencies[:1] / GRID_REACH, frequencies, [top]])
         peaks = np.unique(coarse.argmax(axis=0))
         near = np.concatenate([np.geomspace(sides[k], sides[k + 2], POINTS_OF_A_PEAK) for k in peaks])
-        fine = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
+        fine = _disturbance_gains(plant, *at_frequencies(observer, observer.fault_rows, near))
         disturbance_gains = np.maximum(coarse.max(axis=0), fine.max(axis=0))
     own = [plant.fault_names.index(name) for name in observer.fault_names]
-    _, slowest, _ = _responses(plant, plant.Bf, plant.Df, points, to_estimate)
+    _, slowest, _ = output_responses(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
     return FaultGains(disturbance_gains, np.asarray(steady))
 
 
 def _disturbance_gains(plant: DescriptorSystem, points: ComplexArray, to_estimate: ComplexArray) -> FloatArray:
     """Return gains from each unknown input to each fault estimate ``(k, nf, nd)``."""
-    _, responses, terms = _responses(plant, plant.Bd, plant.Dd, points, to_estimate)
+    _, responses, terms = output_responses(plant, plant.Bd, plant.Dd, points, to_estimate)
     return _above_rounding(np.abs(responses), terms[:, None, None])
-
-
-def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    """Return frequencies (rad/s), their points on the boundary, and what some outputs make of y there."""
-    frequencies = frequency_grid(observer)[1:]
-    return frequencies, *_at_frequencies(observer, rows, frequencies)
-
-
-def _at_frequencies(
-    observer: LinearObserver, rows: slice, frequencies: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return the points on the boundary of some frequencies (rad/s), and what some outputs make of y there."""
-    points = boundary_points(frequencies, observer.dt)
-    return points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
-
-
-def _responses(
-    plant: DescriptorSystem, b: FloatArray, d: FloatArray, points: ComplexArray, to_estimate: ComplexArray
-) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return the states that an input drives, what the outputs show of it, and the size of the terms of that."""
-    states = _state_response(plant, b, points)
-    outputs = plant.C @ states + d
-    return states, np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
 
 
 def _above_rounding(sizes: Any, terms: FloatArray) -> FloatArray:
@@ -181,32 +153,10 @@ def _above_rounding(sizes: Any, terms: FloatArray) -> FloatArray:
     return np.asarray(np.where(sizes > GAIN_ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
 
 
-def _sizes(matrices: ComplexArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(matrices, axis=(1, 2)))
-
-
 def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
     """Return what a known delay makes of each state, ``(k, nx, 1)``."""
     delays = np.array(observer.state_delays, dtype=float)
     return np.asarray(points[:, None, None] ** -delays[None, :, None])
-
-
-def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
-    """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
-    if regularity_of(plant)[0]:
-        try:
-            return np.concatenate([*resolved(plant.E, plant.A, b, points)])
-        except np.linalg.LinAlgError:
-            pass  # beside an integrator a low frequency is lost in rounding
-    return np.stack([_least_state(point * plant.E - plant.A, b) for point in points])
-
-
-def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:
-    """Return the least ``x`` with ``pencil x = b``, where each row and column has a size near one."""
-    nx = pencil.shape[1]
-    scaled, columns = equilibrated(np.hstack([pencil, b]))
-    solution = np.linalg.pinv(scaled[:, :nx], rcond=RANK_TOLERANCE) @ scaled[:, nx:]
-    return np.asarray(columns[:nx, None] * solution / columns[nx:])
 
 
 @arguments_checked

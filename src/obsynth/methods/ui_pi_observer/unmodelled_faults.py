@@ -10,11 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from obsynth.analysis.existence.augmented_pencils import number
-from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, real_array
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.invariant_zeros import is_outside, system_pencil, system_zeros, zeros_with_directions
 from obsynth.numerics.norms import balanced_realisation, response
@@ -27,7 +24,6 @@ from obsynth.plants.faults import balanced_transition
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import leading_names
 from obsynth.results.checks import Check, information
-from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
 #: A fault estimate counts as faithful up to the frequency where it misses by this share of the fault.
@@ -40,43 +36,6 @@ SETTLING_BAND, SETTLING_TIME_CONSTANTS = 0.02, 4.0
 CONSTANT = 1e-9
 
 
-@arguments_checked
-def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArray:
-    """Return the frequency response from the faults to their estimates: what a sinusoidal fault looks like.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        By ``ui-pi-observer``; the fault model plays no role here.
-    frequencies : array_like, rad/s
-        ``(k,)``.
-
-    Returns
-    -------
-    ComplexArray
-        ``(k, nf, nf)``: entry (i, j) is ``fhat_i / f_j``; the identity where the estimates are faithful.
-
-    Raises
-    ------
-    SpecError
-        The design holds no tracking map.
-
-    Examples
-    --------
-    >>> import obsynth
-    >>> plant = obsynth.DescriptorSystem(
-    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
-    ... )
-    >>> design = obsynth.ui_pi_observer(plant, decay=0.5)
-    >>> abs(obsynth.fault_response(design, [1e-6])).round(3).ravel().tolist()
-    [1.0]
-    """
-    if "tracking" not in design.certificate.matrices:
-        raise SpecError("The design holds no tracking map: fhat/f cannot be computed.", path="certificate")
-    points = boundary_points(np.atleast_1d(real_array(frequencies, "frequencies")).ravel(), design.linear[0].dt)
-    return _transfer(*design.linear, design.certificate.matrices["tracking"], points)
-
-
 def _system(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -85,9 +44,10 @@ def _system(
     return *balanced_realisation(errors.Az, errors.fault, -errors.fault_output[0]), errors.fault_output[1]
 
 
-def _transfer(
+def tracking_response(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, points: ComplexArray
 ) -> ComplexArray:
+    """Return ``fhat/f (k, nf, nf)`` at points of the boundary, of the error system: no mode of the plant is in it."""
     return response(*_system(plant, observer, tracking), points)
 
 
@@ -132,7 +92,7 @@ def tracking_rows(
     if not is_stable(observer):
         return
     frequencies = frequency_grid(observer)
-    gains = _transfer(plant, observer, tracking, boundary_points(frequencies, plant.dt))
+    gains = tracking_response(plant, observer, tracking, boundary_points(frequencies, plant.dt))
     errors = steady_errors(plant, observer, tracking, phi, cw)
     for fault, name in enumerate(plant.fault_names):
         own = gains[:, fault, fault]
@@ -178,7 +138,7 @@ def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatAr
         if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
             continue
         fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)
-        value = _transfer(plant, observer, tracking, np.array([place]))[0] @ fault
+        value = tracking_response(plant, observer, tracking, np.array([place]))[0] @ fault
         names = leading_names(np.abs(fault), plant.fault_names)
         yield information(
             f"limit at {number(place)}",
