@@ -81,7 +81,8 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
         "data is an array, whose columns have no names",
     ),
     "an empty array for a scenario": (
-        lambda: obsynth.guaranteed_test(plant(**FAULTY), scenario=np.array([])), "scenario is for plants whose constants",
+        lambda: obsynth.guaranteed_test(plant(**FAULTY), scenario=np.array([])),
+        "scenario is for plants whose constants",
     ),
     "a first state that is a text": (
         lambda: obsynth.descriptor_kalman(plant(**FAULTY), initial_state=""), "initial_state is '': give real numbers",
