@@ -1,13 +1,14 @@
 """The gains of a recursive observer follow from it alone: those who look at them share one computation."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import obsynth
 from obsynth.errors import PreconditionError
-from obsynth.observers.recursive import gain_schedule
+from obsynth.observers.recursive import gain_schedule, gain_schedule_summary
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps, shared_gains
 
 
@@ -39,6 +40,27 @@ def test_design_and_verification_take_each_step_once(monkeypatch: pytest.MonkeyP
     again = obsynth.verify(design.replace(observer=obsynth.descriptor_kalman(plant(0.815), Q=0.01).observer))
     assert again.passed
     assert len(taken) == 2 * design.certificate.claims["steps"]
+
+
+def test_their_summary_is_taken_once_however_many_numbers_they_are(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    observers: list[object] = []
+
+    def counted(observer, **options):
+        observers.append(observer)
+        return summary(observer, **options)
+
+    summary = gain_schedule_summary.gain_schedule_summary
+    monkeypatch.setattr(gain_schedule, "MOST_KEPT_GAINS", 0)
+    monkeypatch.setattr(gain_schedule_summary, "gain_schedule_summary", counted)
+    design = obsynth.descriptor_kalman(plant(0.845), Q=0.01)
+    assert design.report.passed
+    assert observers == [design.observer]
+    # Stored and loaded it is another observer, whose gains nobody has looked at.
+    loaded = obsynth.load(design.save(tmp_path / "gains.json"))
+    assert obsynth.verify(loaded).passed
+    assert observers == [design.observer, loaded.observer]
 
 
 def test_from_several_threads_they_are_those_of_one() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 
 from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.observers.recursive.estimates import excitation_levels
-from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
+from obsynth.observers.recursive.gain_schedule import Gains, gain_steps, shared_gains
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.sample import deviations_in
 from obsynth.observers.recursive.steady_filter import settled_contraction
@@ -132,6 +132,13 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
         deviations=deviations,
         state_deviations=state_deviations,
     )
+
+
+@remembered
+def shared_summary(observer: RecursiveObserver) -> GainScheduleSummary:
+    """Return the same, once for an observer: of many states synthesis and verification would follow steps for seconds
+    each, of the same matrices that never change."""
+    return gain_schedule_summary(observer, gains=shared_gains)
 
 
 def _first_end(observer: RecursiveObserver, steps: int) -> int:

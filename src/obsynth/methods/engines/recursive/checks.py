@@ -29,8 +29,8 @@ from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
-    gain_schedule_summary,
     looked_at,
+    shared_summary,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.options import observer_from_options
@@ -125,7 +125,7 @@ def _dynamic_rows(
 ) -> Iterator[Check]:
     """Yield the rows on what the observer does; ``same`` says that its matrices are those that are stated."""
     ranks, gains = horizon_ranks(observer.plant, early=observer.early_constraints), shared_gains
-    facts = gain_schedule_summary(observer, gains=gains)
+    facts = shared_summary(observer)
     yield information(
         "condition of H",
         "largest condition number of [E_k; C_k]",

@@ -18,12 +18,11 @@ from obsynth.methods.method import Method, Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import covariance_factor, decide_rank
-from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     CLEARLY_STABLE,
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
-    gain_schedule_summary,
+    shared_summary,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.options import has_text, observer_from_options, plain_options
@@ -143,7 +142,7 @@ def _of_varying(
     """Return observer, gains, claims and notes; ``missing``: covariances of noise that were not stated."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
-    facts = gain_schedule_summary(observer, gains=shared_gains)
+    facts = shared_summary(observer)
     contracts = _contracts(facts) and not facts.settles
     if missing and not own_units and not contracts and plant.ne == plant.nx and _has_steady_state(observer):
         still = DescriptorSystem(
@@ -151,7 +150,7 @@ def _of_varying(
         )
         options, own_units = {**options, **_identities(PlantUnits.of(still).rounded(), options)}, True
         observer = observer_from_options(plant, options)
-        facts = gain_schedule_summary(observer, gains=shared_gains)
+        facts = shared_summary(observer)
     _require_contraction(observer, facts, () if own_units else missing)
     claims = {
         "condition": ranks.condition,
