@@ -29,6 +29,7 @@ from obsynth.simulation.benches import bench_of, rows_without_claim
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import simulate_plant, simulate_time_varying
 from obsynth.simulation.over_region import simulate_polytopic
+from obsynth.simulation.plant_alone import PlantAlone, simulate_scenario
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.trajectory import Trajectory
 
@@ -210,6 +211,13 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
 @overload
 def simulate(
     design: DescriptorSystem | PolytopicSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
+    scenario: Scenario,
+) -> Trajectory: ...
+
+
+@overload
+def simulate(
+    design: DescriptorSystem | PolytopicSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
     **signals: Any,
 ) -> Trajectory: ...
 
@@ -225,21 +233,22 @@ def simulate(
     scenario: Scenario | None = None,
     **signals: Any,
 ) -> Simulation | Trajectory:
-    """Simulate a design's plant over a scenario, with its observer beside it; or a plant alone, with given signals.
+    """Simulate a design's plant over a scenario, with its observer beside it; or a plant alone.
 
     Parameters
     ----------
     design : ObserverDesign, DescriptorSystem, PolytopicSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         A design of any method, the plant of a linear one of index 0 or 1; or a plant.
     scenario : Scenario, optional
-        What happens; for a design.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the
-        nominal inputs and parameters, ``noise`` multiplies the deviations that the design states, and states without a
-        value start where the observer does (those of a DAE at their nominal values).
+        What happens.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the nominal inputs and
+        parameters, ``noise`` multiplies the deviations that the design states, and states without a value start where
+        the observer does (those of a DAE at their nominal values).  A plant alone has no observer to start, and a DAE
+        alone needs ``sample_time``.
     **signals
-        For a plant alone.  A discrete linear one: ``steps`` samples, with ``u (steps, nu)``, ``f (steps, nf)``,
-        ``d (steps, nd)``, ``w (steps, nw)`` and ``initial_state (nx,)``, zero by default.  A time-varying one: as
-        `simulate_time_varying`.  A DAE: as `simulate_dae`.  A plant over a region: its course ``scheduling
-        (samples, p)``, the same signals, and ``sample_time`` in continuous time.
+        For a plant alone without a scenario.  A discrete linear one: ``steps`` samples, with ``u (steps, nu)``,
+        ``f (steps, nf)``, ``d (steps, nd)``, ``w (steps, nw)`` and ``initial_state (nx,)``, zero by default.  A
+        time-varying one: as `simulate_time_varying`.  A DAE: as `simulate_dae`.  A plant over a region: its course
+        ``scheduling (samples, p)``, the same signals, and ``sample_time`` in continuous time.
 
     Returns
     -------
@@ -280,8 +289,16 @@ def simulate(
     """
     design = design.plant if isinstance(design, Transformation) else design
     for kind, plant_alone in _PLANT_SIMULATIONS.items():
-        if isinstance(design, kind) and scenario is None:
-            trajectory: Trajectory = plant_alone(design, **signals)
+        if isinstance(design, kind):
+            if scenario is not None and signals:
+                raise SpecError(
+                    f"{', '.join(signals)}: give a scenario, or the signals of a plant alone.", path=next(iter(signals))
+                )
+            trajectory: Trajectory = (
+                plant_alone(design, **signals)
+                if scenario is None
+                else simulate_scenario(cast(PlantAlone, design), scenario)
+            )
             return trajectory
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
