@@ -68,9 +68,7 @@ def _with_delays(plant: DescriptorSystem, scenario: Scenario, start: FloatArray)
 def _nonlinear(model: DAEModel, scenario: Scenario) -> Trajectory:
     """Return what a nonlinear plant does, from its nominal values where a scenario says nothing else."""
     if scenario.sample_time is None:
-        raise SpecError(
-            "A nonlinear plant is simulated in steps: give the scenario a sample_time.", path="sample_time"
-        )
+        raise SpecError("A nonlinear plant is simulated in steps: give the scenario a sample_time.", path="sample_time")
     drive = resolve_parameters(model, scenario, dt=scenario.sample_time)
     inputs, parameters, sensor_noise = _of_parameters(drive, scenario, len(model.input_names))
     run = simulate_dae(
