@@ -369,7 +369,12 @@ FILES = [
         files=written("n.json", '"abcd"'),
     ),
     Case("names file of another kind", put("plant", "state_names", {"file": "n.txt"}), "unknown suffix"),
-    Case("missing plant file", put("plant", {"file": "plant.yaml"}), "plant.yaml does not exist"),
+    Case(
+        "missing plant file",
+        put("plant", {"file": "plant.yaml"}),
+        "plant.yaml does not exist",
+        more=("spec.yaml, line ",),
+    ),
     Case("plant file is a folder", put("plant", {"file": "p"}), "is a folder", files=lambda d: (d / "p").mkdir()),
     Case("plant file and more", put("plant", {"file": "plant.yaml", "dt": 1}), "plant.dt: unknown key"),
     Case(

@@ -124,6 +124,16 @@ def test_what_a_method_alone_asks_for_is_not_called_impossible():
     assert not any(check.of_the_method for check in rows)
 
 
+def test_check_with_all_conditions_leaves_out_those_of_methods_for_other_kinds_of_plants(capsys):
+    assert main(["check", "-v", "--system", str(DESIGNS / "wang2015" / "spec.yaml")]) == 0
+    printed = capsys.readouterr().out
+    assert "Existence conditions of ui-pi-observer" in printed
+    for method in ("pd-observer", "detection-filter", "region-observer", "extended-kalman"):
+        assert f"Existence conditions of {method}" not in printed
+        assert printed.count(method) == 1
+    assert printed.count("ui-pi-observer: all conditions hold") == 1
+
+
 @pytest.mark.long
 def test_check_says_one_line_per_method(capsys):
     assert main(["check", "--system", str(DESIGNS / "filasova" / "spec.yaml")]) == 0

@@ -119,7 +119,7 @@ def run_check(options: argparse.Namespace) -> int:
         if not_known:
             console.print(f"{not_known}\n")
         if options.verbose:
-            check_report(spec.plant, structures, methods, console=console, transformation=done)
+            check_report(spec.plant, structures, methods, console=console, own=spec.method, transformation=done)
             console.print()
         over_region = isinstance(spec.plant, obsynth.PolytopicSystem)
         print_methods(methods, own=spec.method, over_region=over_region, console=console)

@@ -66,6 +66,9 @@ _OVER_REGION, _REGION_OBSERVER = f"exists: {REGION_CONDITION}", "region-observer
 
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
+#: Conditions that say nothing about a plant but its kind.
+_CONDITIONS_ON_THE_KIND = {_PLANT_KIND, _OF_THIS_KIND, *_TIME_CONDITIONS}
+
 _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
 
 
@@ -95,9 +98,13 @@ def check_report(
     methods: Mapping[str, VerificationReport],
     *,
     console: Console,
+    own: str = "",
     transformation: str = "",
 ) -> None:
-    """Print the structure of a plant, and for each method whether it exists for this plant."""
+    """Print the structure of a plant, and the existence conditions of each method for plants of this kind.
+
+    A method for another kind of plant has no table, unless it is the spec's ``own``: it has a line by `print_methods`.
+    """
     facts = list(plant_facts(plant))
     if transformation:
         facts.insert(0, ("transformed", transformation))
@@ -111,23 +118,9 @@ def check_report(
         console.print()
         console.print(Text(text))
     for method, report in methods.items():
-        title = f"Existence conditions of {method}"
-        print_section(console, title, checks_table(report.checks, width=console.width))
-        console.print(
-            _existence_line(
-                method, report, over_region=isinstance(plant, PolytopicSystem) or method == _REGION_OBSERVER
-            )
-        )
-
-
-def _existence_line(method: str, report: VerificationReport, *, over_region: bool) -> Text:
-    if report.passed:
-        return Text(f"{method}: {_all_hold(report, over_region)}.", style="green")
-    failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
-    if {check.name for check in report.failures} & _OPTION_CONDITIONS:
-        return Text(f"{method}: needs more options: {failed}.", style="yellow")
-    verdict, style = _verdict(report.failures)
-    return Text(f"{method}: {verdict}: {failed}.", style=style)
+        if method == own or not {check.name for check in report.failures} & _CONDITIONS_ON_THE_KIND:
+            title = f"Existence conditions of {method}"
+            print_section(console, title, checks_table(report.checks, width=console.width))
 
 
 def is_unclear(failed: Sequence[Check]) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import path_of
+from obsynth.files.inputs import input_file, path_of
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.libraries import one_thread_if_small
@@ -32,6 +32,7 @@ from obsynth.specs.plant_sections import (
     noise_model_of,
     noise_needs_states,
     none_of_noise,
+    placed,
     read_value,
 )
 from obsynth.specs.scenario_section import built_scenario
@@ -316,6 +317,7 @@ def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tu
     if imported is not None or not hasattr(section, "file"):
         return section, source, "plant", imported
     place = source.parent / section.file
+    placed(lambda: input_file(place), source, "plant.file")
     return checked_plant(changed_document(read_yaml(place, where="plant.file"), changes), place), place, "", None
 
 

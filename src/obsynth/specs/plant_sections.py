@@ -77,7 +77,7 @@ def built_plant(
     return plant
 
 
-def _placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
+def placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
     """Return the plant that is made; an error gets its place in the document."""
     try:
         return make()
@@ -149,7 +149,7 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
         ("E", "A", "B", "C", "D", "Phi", "Psi"),
         names,
     )
-    return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
+    return placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 
 
 def noise_model_of(section: Any) -> dict[str, Any]:
@@ -186,7 +186,7 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
                 units.setdefault(name, constant.unit)
         return DAEModel(**arguments)
 
-    return _placed(made, source, prefix)
+    return placed(made, source, prefix)
 
 
 def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> PolytopicSystem:
@@ -216,7 +216,7 @@ def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> Polyto
         scheduling = {name: item.model_dump(exclude_none=True) for name, item in (section.scheduling or {}).items()}
         return PolytopicSystem(plant=values, scheduling=scheduling, constants=section.constants)
 
-    return _placed(made, source, prefix)
+    return placed(made, source, prefix)
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem | PolytopicSystem:
@@ -245,7 +245,7 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         named = {name: unit for name, unit in units.items() if name in functionals}
         return with_constants(with_functionals(plant, functionals, units=named), section, source.parent)
 
-    return _placed(made, source, prefix)
+    return placed(made, source, prefix)
 
 
 def imported_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
@@ -255,7 +255,7 @@ def imported_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | 
     if suffix == ".mat":
         from obsynth.plants.importing.matlab_models import from_matlab
 
-        return _placed(lambda: from_matlab(path, **arguments), spec, "plant")
+        return placed(lambda: from_matlab(path, **arguments), spec, "plant")
     wrong = [name for name in arguments if suffix != ".mo" or name in _OF_MATLAB]
     if wrong:
         what = "a linear model of OpenModelica, which says that itself" if suffix == ".mo" else "no .mat or .mo file"
@@ -266,7 +266,7 @@ def imported_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | 
     if suffix == ".mo":
         from obsynth.plants.importing.modelica_models import from_modelica
 
-        return _placed(lambda: from_modelica(path, **arguments), spec, "plant")
+        return placed(lambda: from_modelica(path, **arguments), spec, "plant")
     if suffix in _OTHER_PLANTS:
         raise SpecError(
             f"{spec}: plant.file: a plant is read from another spec (.yaml), a .mat or a .mo file, not from "
