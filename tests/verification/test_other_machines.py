@@ -20,8 +20,9 @@ from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.plants.transformations.elimination import dynamic_coordinates
 from obsynth.proofs import contraction
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import REMAINDER_OF_SUM, prove_contraction, proved_contractions
+from obsynth.proofs.contraction import prove_contraction, proved_contractions
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
+from obsynth.proofs.peak_sums import REMAINDER_OF_SUM
 from obsynth.verification import inequalities, stored_numbers
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

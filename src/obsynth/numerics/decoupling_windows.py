@@ -1,15 +1,16 @@
-"""Windows of samples free of faults and unknown inputs, which turn fault estimation into plain estimation.
+"""Combinations of a window of samples that decouple faults and unknown inputs: fault estimation as plain estimation.
+
+Every causal linear filter that decouples h = (f, d), or d alone, exactly is ``fhat0 - Z r`` with a causal Z, and
 
     xi+ = A xi + B w,   r = C xi + D w,   e0 = L xi + D1 w
 
-holds for the errors of every causal linear filter that decouples h = (f, d), or d alone, exactly: each of them is
-``fhat0 - Z r`` with a causal Z, so that no filter is lost.  With ``Y_k = (y_{k-W}, ..., y_k) = O x_{k-W} + T_h H + T_w
+is the error system of ``fhat0`` and r.  With ``Y_k = (y_{k-W}, ..., y_k) = O x_{k-W} + T_h H + T_w
 W_k`` and ``G T_h = [Bh 0 .. 0]``, ``Mf T_h = [selects f_{k-L}]``, ``V T_h = 0``, the bank
 
     chi+ = A chi + G (Y - O chi),   fhat0 = Mf (Y - O chi),   r = V (Y - O chi)
 
-sees no h.  Continuous time needs no window after the Cayley transform.  Source: ours; compare A. Varga, *Solving Fault
-Diagnosis Problems*, 2017, sections 5.2 and 7.4 to 7.9 (null-space method).
+does not depend on h.  In continuous time no window is needed after the Cayley transform.  Source: ours; compare
+A. Varga, *Solving Fault Diagnosis Problems*, 2017, sections 5.2 and 7.4 to 7.9 (null-space method).
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import cayley, cayley_point, reachable_basis, standard_form
 from obsynth.numerics.unseen_inputs import seen_part
 
-#: Most windows that suffice are this short: longer ones are looked for by doubling.
+#: Most sufficient windows are this short; longer ones are searched by doubling.
 LENGTHS_ONE_BY_ONE = 8
-#: An identity of the windows holds to this.
+#: Largest residual of an identity of a window.
 WINDOW_IDENTITY = 1e-7
-#: What passes from an input of a reference model by less than this share is rounding: it passes later.
+#: A response of a reference model below this share is rounding: the input counts as further delayed.
 DEAD_SHARE = 1e-9
-#: Modes of a core beyond this modulus count as not asymptotically stable where what nobody sees is taken out.
+#: When unobservable modes are removed, modes beyond this modulus count as not asymptotically stable.
 EDGE_OF_STABILITY = 0.999
-#: What is seen of such a mode, relative to the outputs.
+#: Observability of such a mode, relative to the outputs, below which it counts as unobservable.
 SEEN_SHARE = 1e-6
-#: The same of finite frequencies: a lag of some order shows little of a fast zero, which it does not cancel, and the
-#: fault map without it is verified to 1e-6.
+#: The same for modes of finite frequency.  A fast zero is hardly observable behind a lag that does not cancel it; the
+#: fault map without such a mode is verified to 1e-6.
 SEEN_FINITE_SHARE = 1e-8
-#: Modes of the Cayley transform this near to -1 are of infinite frequency: of order 4 they come out at eps^(1/4).
+#: Modes of the Cayley transform within this distance of -1 have infinite frequency; one of order 4 is off by eps^(1/4).
 NEAR_INFINITY = 1e-2
 
 Model = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -71,7 +72,7 @@ class Channels(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EstimationProblem:
-    """The problem of estimation, and the bank: ``chi+ = A chi + G Y``, ``r = V Y - C chi``, ``fhat0 = F Y - L chi``."""
+    """The estimation problem and filter bank: ``chi+ = A chi + G Y``, ``r = V Y - C chi``, ``fhat0 = F Y - L chi``."""
 
     A: FloatArray
     B: FloatArray
@@ -105,7 +106,7 @@ def estimation_problem(
     poles: ComplexArray | None = None,
     brief: bool = False,
 ) -> EstimationProblem:
-    """Return the problem of estimation of a plant.
+    """Return the estimation problem of a plant.
 
     Parameters
     ----------
@@ -114,14 +115,14 @@ def estimation_problem(
     delay : int or sequence of int, optional
         Samples L of the exact fault map ``z^-L`` (discrete time), of all faults or of each.
     reference : tuple of FloatArray, optional
-        A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults (of the delayed ones).
+        A reference model ``(a, b, c, d)`` from the faults (the delayed faults) to the required estimate.
     exact : bool, optional
-        Whether faults pass exactly by the fault map; otherwise they drive the error beside w (model matching).
+        Whether the fault map is exact; otherwise faults drive the error as w does (model matching).
     poles : ComplexArray, optional
         Finite poles of the plant, which place the Cayley point; by default all eigenvalues of its pencil.
     brief : bool, optional
-        Whether a delay that the faults' first responses exclude is refused at once, without the shortest delays: long
-        windows are needed for these, and who tries delays in turn does not read them.
+        Whether a delay that the faults' first responses exclude is refused at once, without computing the shortest
+        delays, which needs long windows: for callers that try delays in turn.
 
     Raises
     ------
@@ -140,10 +141,10 @@ def estimation_problem(
     bh, dh = (np.hstack([bf, bd]), np.hstack([df, dd])) if exact else (bd, dd)
     if not exact:
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
-    # Of what no output shows nothing is told, and nothing need be reported.
+    # Remove the inputs that reach no output: they cannot be estimated and need not be decoupled.
     visible = seen_part(form.A, bh, form.C, dh)
     wanted, reference = (
-        _told_from_outputs(visible.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
+        _distinguishable_faults(visible.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
     )
     a, c, bw = visible.states @ form.A @ visible.states.T, form.C @ visible.states.T, visible.states @ bw
     hidden = visible.states @ bh @ visible.inputs, dh @ visible.inputs
@@ -158,7 +159,7 @@ def estimation_problem(
     window = _decoupling_window(a, c, hidden, (bw, dw), selection, lags, plant.dt, form.shift)
     core = _core(a, (bw, dw), window, len(c))
     if reference is not None:
-        # Where all inputs are taken later, the faults of now are those of some samples before.
+        # Where all inputs are delayed by some samples, the reference model has to be delayed likewise.
         reference = reference if exact else with_late_inputs(reference, form.shift)
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
         core = _with_reference(core, reference, form.alpha if plant.dt == 0.0 else None, None if exact else newest)
@@ -167,8 +168,11 @@ def estimation_problem(
     return EstimationProblem(*chained, window.length, form.alpha, form.shift)
 
 
-def _told_from_outputs(unseen: FloatArray, nf: int, reference: Model | None) -> tuple[FloatArray, Model | None]:
-    """Return combinations of the faults that are told from the outputs and that the reference model is driven by."""
+def _distinguishable_faults(unseen: FloatArray, nf: int, reference: Model | None) -> tuple[FloatArray, Model | None]:
+    """Return the combinations of faults that drive the reference model, and the model with these as inputs.
+
+    Raises `PreconditionError` where the outputs cannot distinguish them.
+    """
     wanted = np.eye(nf)
     if np.linalg.norm(unseen) > WINDOW_IDENTITY and reference is not None:
         a, b, c, d = reference
@@ -186,9 +190,9 @@ def _told_from_outputs(unseen: FloatArray, nf: int, reference: Model | None) -> 
 
 
 def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int64], Model]:
-    """Return the samples that each input of a model takes to its outputs, and the model without them.
+    """Return the delay of each input of a model to its outputs, in samples, and the model without these delays.
 
-    Faults that are known so many samples late drive the rest: ``C A^(L-1) B`` is then what passes at once.
+    With a delay L the Markov parameter ``C A^(L-1) B`` becomes the direct feedthrough.
     """
     a, b, c, d = model
     lags, delayed_b, direct = np.zeros(d.shape[1], dtype=np.int64), b.copy(), d.copy()
@@ -203,7 +207,7 @@ def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int
 
 
 def with_late_inputs(model: Model, samples: int) -> Model:
-    """Return a model behind so many samples of delay of all its inputs."""
+    """Return a model whose inputs are delayed by a number of samples."""
     a, b, c, d = model
     for _ in range(samples):
         count = b.shape[1]
@@ -213,7 +217,7 @@ def with_late_inputs(model: Model, samples: int) -> Model:
 
 
 def first_responses(model: Model, count: int) -> list[FloatArray]:
-    """Return what a model shows of an impulse in the first samples, one by one."""
+    """Return the first ``count`` Markov parameters of a model: D, C B, C A B, ..."""
     a, b, c, d = model
     responses, moved = [d][:count], b
     while len(responses) < count:
@@ -242,7 +246,7 @@ def _decoupling_window(
     dt: float,
     shift: int,
 ) -> _Window:
-    """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
+    """Return the shortest window that decouples unknown inputs and estimates the faults; raise where there is none."""
     n, lag = len(a), int(np.max(lags, initial=0))
     shortest, longest = lag, n + lag + 1
     window = _first_window(
@@ -269,7 +273,7 @@ def _decoupling_window(
 def _may_show_within(
     a: FloatArray, c: FloatArray, hidden: tuple[FloatArray, FloatArray], selection: FloatArray, lags: NDArray[np.int64]
 ) -> bool:
-    """Whether the first responses span each fault: these are all that a window of any length has of one sample."""
+    """Whether the first responses span each fault: a window of any length has no other rows for one sample."""
     responses = first_responses((a, hidden[0], c, hidden[1]), int(np.max(lags, initial=0)) + 1)
     for fault, late in zip(selection, lags.tolist(), strict=True):
         spanning = np.vstack(responses[: late + 1]).T
@@ -280,7 +284,7 @@ def _may_show_within(
 
 
 def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:
-    """Return the fewest samples after which a long window shows each fault: rows that the outputs' rows span."""
+    """Return the shortest delay with which a long window estimates each fault."""
     count = selection.shape[1]
     residual = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th - np.eye(th.shape[1])
     newest_first = [selection @ residual[i : i + count] for i in reversed(range(0, len(residual), count))]
@@ -311,8 +315,8 @@ class _TriedWindow(NamedTuple):
 def _first_window(tried: Callable[[int], _TriedWindow], shortest: int, longest: int) -> _TriedWindow:
     """Return the shortest window that suffices, or the longest one.
 
-    What a window reconstructs a longer one does too: after `LENGTHS_ONE_BY_ONE` the lengths double, and the last
-    interval is halved.
+    Every window longer than a sufficient one suffices, too: after `LENGTHS_ONE_BY_ONE` the lengths double, and the
+    last interval is bisected.
     """
     for length in range(shortest, min(shortest + LENGTHS_ONE_BY_ONE, longest) + 1):
         window = tried(length)
@@ -364,7 +368,7 @@ def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, 
     parity = (
         scipy.linalg.null_space(window.Th.T, rcond=WINDOW_RANK_TOLERANCE).T if hidden else np.eye(len(window.observed))
     )
-    # Combinations without the newest sample are repeated by those of the sample before.
+    # A combination without the newest sample is that of the previous sample again: leave it out.
     directions, values, _ = np.linalg.svd(parity[:, -ny:], full_matrices=False)
     parity = directions[:, values > WINDOW_RANK_TOLERANCE].T @ parity
     first = np.hstack([np.eye(nw), np.zeros((nw, nw * length))])
@@ -382,7 +386,10 @@ def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, 
 
 
 def _with_reference(core: _Core, reference: Model, alpha: float | None, newest: FloatArray | None) -> _Core:
-    """Put the reference model behind the exact estimates, or beside the plant: ``newest`` picks its faults of w."""
+    """Return the core with the reference model in series with the exact estimates, or, with ``newest``, in parallel.
+
+    ``newest`` selects from w the faults that drive a model in parallel.
+    """
     a, b, c, d = reference
     k = len(a)
     if alpha is not None:
@@ -400,7 +407,7 @@ def _with_reference(core: _Core, reference: Model, alpha: float | None, newest: 
 
 
 def _without_unseen(core: _Core, *, modelled: bool, continuous: bool) -> _Core:
-    """Take out modes that neither r nor e shows: zeros of the faults that the reference cancels, and unreached ones."""
+    """Return the core without modes that are unobservable from r and e: zeros that the reference model cancels."""
     A, B, C, D, L, D1, G, V, F = core
     for at_infinity in ((True, False) if continuous else (None,)) if modelled else ():
         if not len(A):
@@ -412,8 +419,10 @@ def _without_unseen(core: _Core, *, modelled: bool, continuous: bool) -> _Core:
 
 
 def _seen_basis(a: FloatArray, outputs: FloatArray, at_infinity: bool | None) -> FloatArray:
-    """Return a basis of what is left without unstable modes that no output shows: of all, or of the Cayley transform
-    those that are ``at_infinity`` or not."""
+    """Return a basis of the states without the unobservable unstable modes.
+
+    ``at_infinity``: remove only modes of infinite (`True`) or of finite (`False`) frequency of a Cayley transform.
+    """
 
     def chosen(x: Any, y: Any = 0.0) -> Any:
         near = np.hypot(x + 1.0, y) <= NEAR_INFINITY
@@ -434,7 +443,7 @@ def _seen_basis(a: FloatArray, outputs: FloatArray, at_infinity: bool | None) ->
 
 
 def _with_chain(core: _Core, nw: int, length: int) -> _Core:
-    """Let the noise of a window enter one sample after the other, the oldest first."""
+    """Return the core with the noise of a window as a chain of delays: samples enter one by one, the oldest first."""
     A, B, C, D, L, D1, G, V, F = core
     if not length:
         return core

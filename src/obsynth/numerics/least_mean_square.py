@@ -1,9 +1,10 @@
-"""The least mean square over all causal linear filters in continuous time, with a filter that reaches it.
+"""The least mean-square error of all causal linear filters in continuous time, and a filter that attains it.
 
-``x' = a x + b w + m Y`` is seen by ``rho Y = c x + d w``, w white; wanted is ``l x + d1 w``.  Outputs without noise of
-their own show states exactly, and their derivatives the others with the noise of the states (Bryson and Johansen 1965):
-without the exact states the same problem has less states.  One such step leaves a filter that needs no derivative.
-What takes more of them is approached, by filters for a little noise on the outputs, as near as one likes.
+The plant is ``x' = a x + b w + m Y`` with outputs ``rho Y = c x + d w`` and white noise w; ``l x + d1 w`` is estimated.
+Outputs without noise of their own give some states exactly, and their derivatives measure the other states with the
+noise of the states (Bryson and Johansen 1965).  Removing the exact states leaves the same problem with fewer states.
+After one such step the filter needs no derivative.  If more steps are needed, the least error is approached to any
+accuracy by filters for a little noise on the outputs.
 """
 
 from __future__ import annotations
@@ -24,29 +25,29 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_ri
 from obsynth.numerics.ranks import ROUNDED_ZERO, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import uncayley
 
-#: Modes of the Cayley transform nearer to -1 are infinite ones.
+#: Modes of the Cayley transform within this distance of -1 are infinite modes of the plant.
 INFINITE_MODE = 1e-10
-#: Multiple ones are farther from it, this much times the root of the precision that their number sets: of 24 random
-#: plants of index 3 the farthest was a tenth of it off.
+#: Multiple infinite modes are farther from -1.  The limit is this factor times the n-th root of the precision for n
+#: modes; in 24 random plants of index 3 the farthest mode was at a tenth of it.
 MOVED_MODES = 1e3
-#: White noise that passes to the error by less than this share is rounding.
+#: Direct feedthrough of white noise to the error below this share is rounding.
 WHITE_SHARE = 1e-9
-#: What passes at once is a difference of products, of which this share is rounding.
+#: That feedthrough is a difference of products; this share of them is rounding.
 WHITE_ROUNDING = 1e3 * float(np.finfo(float).eps)
-#: Noise added to the outputs, of what the states' noise does to them, largest first.
+#: Noise added to the outputs, relative to the effect of the state noise on them, largest first.
 ADDED_NOISES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-#: Less noise is added until the mean square, its root, is so near the least one.
+#: The added noise is reduced until the root mean square is within this factor of the least one.
 NEAR_THE_LEAST = 1.01
-#: Where the least one is zero, as small beside that of no filter at all.
+#: Where the least one is zero: until the root mean square is this share of that with the largest added noise.
 NEARLY_ZERO = 1e-3
-#: Below this share of that of the filter the least one is rounding: the root of that of a covariance.
+#: A least root mean square below this share of the filter's is rounding: the square root of that of a covariance.
 ROUNDING_SHARE = 1e-5
-#: So is one below this share of what w drives the states to: some roots of the precision of double numbers.
+#: So is one below this share of the states that w excites: a few times the root of the double precision.
 ROUNDED_ROOT = 1e-7
 
 
 class ContinuousFilter(NamedTuple):
-    """``chi' = A chi + B Y``, ``ehat = C chi + D Y``, and the root mean square of its error, beside the least one."""
+    """A filter ``chi' = A chi + B Y``, ``ehat = C chi + D Y``, the root mean square of its error, and the least one."""
 
     filter: Model
     deviation: float
@@ -56,9 +57,9 @@ class ContinuousFilter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """``x' = a x + b w`` is seen by ``c x + d w``.
+    """A plant ``x' = a x + b w`` with outputs ``c x + d w``.
 
-    ``units`` are the sizes of what the rows of d are differences of, ``reach`` is that of what w drives the states to.
+    ``units``: sizes of the terms whose differences are the rows of d.  ``reach``: size of the states that w excites.
     """
 
     a: FloatArray
@@ -69,12 +70,12 @@ class _Measured:
     reach: float
 
     def covariance(self) -> FloatArray:
-        """Return the least covariance of the error of x; raise `PreconditionError` where there is none."""
+        """Return the least error covariance of x; raise `PreconditionError` where there is none."""
         a, b, c, d = self.a, self.b, self.c, self.d
         if not len(a):
             return np.zeros_like(a)
         if not len(c):
-            # Nothing is left to be weighed: there is one filter.
+            # Without outputs there is one filter.
             if np.any(np.linalg.eigvals(a).real >= -0.5 * (1.0 - STABLE_RADIUS) * np.linalg.norm(a)):
                 raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
             return continuous_lyapunov(a, -b @ b.T)
@@ -98,22 +99,22 @@ class _Measured:
         )
 
     def deviation(self, gain: FloatArray, wanted: FloatArray) -> float:
-        """Return the root mean square of ``wanted`` times the error of a filter with this gain."""
+        """Return the root mean square of ``wanted @ error`` of the filter with this gain."""
         closed, driven = self.a - gain @ self.c, self.b - gain @ self.d
         spread = continuous_lyapunov(closed, -driven @ driven.T) if len(closed) else np.zeros_like(closed)
         return float(np.sqrt(max(np.trace(wanted @ spread @ wanted.T), 0.0)))
 
-    def shows(self) -> NDArray[np.bool_]:
-        """Return which outputs show more than rounding."""
+    def informative(self) -> NDArray[np.bool_]:
+        """Return which outputs contain more than rounding."""
         own = np.linalg.norm(self.d, axis=1) + np.linalg.norm(self.c, axis=1) * self.reach
         return np.asarray(own > WINDOW_RANK_TOLERANCE * self.units)
 
     def of_rows(self, rows: NDArray[np.bool_]) -> _Measured:
-        """Return the same with some of its outputs."""
+        """Return the plant with some of its outputs."""
         return replace(self, c=self.c[rows], d=self.d[rows], units=self.units[rows])
 
     def with_noise(self, share: float) -> _Measured:
-        """Return the same with noise of its own on every output: a share of what the states' noise does to it."""
+        """Return the plant with noise added to every output: a share of the effect of the state noise on it."""
         rows, rate = len(self.c), max(float(np.linalg.norm(self.a)), SMALLEST)
         size = share * (float(np.linalg.norm(self.c) * np.linalg.norm(self.b)) / rate + float(np.linalg.norm(self.d)))
         b = np.hstack([self.b, np.zeros((len(self.b), rows))])
@@ -121,9 +122,9 @@ class _Measured:
 
 
 class _Split(NamedTuple):
-    """The states that outputs do not show exactly, ``N' x``, as a problem of their own, and the way back.
+    """The states ``x1 = N' x`` that the outputs do not give exactly, as a problem of their own, and the way back to x.
 
-    ``shown @ c`` times x is shown exactly, ``noisy @ c x + ...`` with noise; ``x = N x1 + known (shown @ c x)``.
+    ``shown @ c x`` is measured exactly, ``noisy @ c x`` with noise; ``x = N x1 + known (shown @ c x)``.
     """
 
     rest: _Measured
@@ -134,11 +135,12 @@ class _Split(NamedTuple):
 
 
 def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (0.0,)) -> ContinuousFilter:
-    """Return the continuous-time filter of least mean square: the Cayley transform of the problem keeps no H2 norm.
+    """Return the continuous-time filter of least mean square error.
 
-    The first of ``noises`` is added to every output; where it is zero, as much as the problem needs.
+    The problem is transformed back from its Cayley transform, which does not preserve the H2 norm.  The first of
+    ``noises`` is added to every output; if it is zero, as much noise as the problem needs.
 
-    Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
+    Raises `PreconditionError` if every filter passes white noise directly to the error, or no filter is stable.
     """
     problem = _without_derivatives(problem)
     rows = len(problem.C)
@@ -155,9 +157,9 @@ def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (
     c, wanted, d1 = outputs[:rows], outputs[rows:], direct[rows:]
     reach = float(np.linalg.norm(np.linalg.inv(np.eye(len(a)) + problem.A)) * np.linalg.norm(problem.B))
     units = np.linalg.norm(problem.D, axis=1) + np.linalg.norm(problem.C, axis=1) * reach
-    # Outputs that follow from others show nothing but rounding.
-    shows = units > WINDOW_RANK_TOLERANCE * np.linalg.norm(residual, axis=1)
-    c, direct, residual, units = c[shows], direct[:rows][shows], residual[shows], units[shows]
+    # Outputs that depend on others contain nothing but rounding.
+    kept = units > WINDOW_RANK_TOLERANCE * np.linalg.norm(residual, axis=1)
+    c, direct, residual, units = c[kept], direct[:rows][kept], residual[kept], units[kept]
     measured = _Measured(a, b, c, direct, units, reach)
     split, added = _split(measured), noises[0]
     noisy = measured.d if split is None else split.noisy @ measured.d
@@ -179,20 +181,20 @@ def least_mean_square(problem: EstimationProblem, *, noises: Sequence[float] = (
 
 
 def _without_derivatives(problem: EstimationProblem) -> EstimationProblem:
-    """Return the same problem where outputs show derivatives of white noise: each is read by a lag, as any filter with
-    a finite mean square reads it.
+    """Return an equivalent problem in which no output contains derivatives of white noise.
 
-    Derivatives are modes at -1 of the Cayley transform.  ``chi+ = A chi + G Y + K r`` with a K that moves these alone
-    leaves out no filter that reads what is left: r passes a stable filter whose zeros are the modes that were moved.
+    Such an output is filtered by a lag, as in every filter with a finite mean square error.  Derivatives are modes at
+    -1 of the Cayley transform.  ``chi+ = A chi + G Y + K r`` with a K that moves these modes alone excludes no filter
+    of finite mean square: r passes a stable filter whose zeros are the moved modes.
     """
     a, size = problem.A, len(problem.A)
     count = int(np.sum(np.abs(1.0 + np.linalg.eigvals(a)) < NEAR_INFINITY))
     near = min(max(INFINITE_MODE, MOVED_MODES * float(np.finfo(float).eps) ** (1.0 / max(count, 1))), NEAR_INFINITY)
 
-    def infinite(x: Any, y: Any = 0.0) -> Any:
+    def is_infinite(x: Any, y: Any = 0.0) -> Any:
         return np.hypot(x + 1.0, y) < near
 
-    schur, vectors, count = scipy.linalg.schur(a, output="real", sort=infinite) if size else (a, a, 0)
+    schur, vectors, count = scipy.linalg.schur(a, output="real", sort=is_infinite) if size else (a, a, 0)
     if not count:
         return problem
     modes, own = schur[:count, :count], vectors[:, :count]
@@ -217,7 +219,7 @@ def _of_the_rest(
     wanted: tuple[FloatArray, FloatArray],
     added: float,
 ) -> ContinuousFilter:
-    """Return the filter of the states that no output shows exactly: its own states are ``N' x - K2 shown``."""
+    """Return the filter of the states that no output gives exactly: its states are ``N' x - K2 (shown @ c x)``."""
     (moved, residual, estimate), N, a, c = inputs, split.N, measured.a, measured.c
     Z0, rows = wanted
     error_rows = rows - Z0 @ c
@@ -237,10 +239,12 @@ def _of_the_rest(
 
 
 def _gain_of_the_rest(rest: _Measured, wanted: FloatArray, least: float, *, added: float) -> tuple[FloatArray, float]:
-    """Return the gain for ``added`` noise, or as much as the problem needs, and that noise; outputs that show nothing
-    have none."""
-    shows = rest.shows()
-    live = rest.of_rows(shows)
+    """Return the gain and the added noise: ``added``, or if that is zero as much as the problem needs.
+
+    Outputs that contain nothing but rounding have a gain of zero.
+    """
+    kept = rest.informative()
+    live = rest.of_rows(kept)
     if added:
         own, noise = live.with_noise(added).gain(), added
     elif _split(live) is None:
@@ -248,12 +252,12 @@ def _gain_of_the_rest(rest: _Measured, wanted: FloatArray, least: float, *, adde
     else:
         own, noise = _noisy_gain(live, wanted, least)
     gain = np.zeros((len(rest.a), len(rest.c)))
-    gain[:, shows] = own
+    gain[:, kept] = own
     return gain, noise
 
 
 def _noisy_gain(measured: _Measured, wanted: FloatArray, least: float) -> tuple[FloatArray, float]:
-    """Return the gain for the most added noise that comes near to the least mean square, and that noise."""
+    """Return the gain for the largest added noise whose mean square error is near the least one, and that noise."""
     enough, best = NEAR_THE_LEAST * least, None
     for share in ADDED_NOISES:
         try:
@@ -273,16 +277,16 @@ def _noisy_gain(measured: _Measured, wanted: FloatArray, least: float) -> tuple[
 
 
 def _least(measured: _Measured, wanted: FloatArray) -> float:
-    """Return the least mean square, its root, of any filter: without states that outputs and derivatives show."""
-    while (split := _split(measured.of_rows(measured.shows()))) is not None:
+    """Return the least root mean square of any filter, from the problem without the states that are known exactly."""
+    while (split := _split(measured.of_rows(measured.informative()))) is not None:
         measured, wanted = split.rest, wanted @ split.N
-    covariance = measured.of_rows(measured.shows()).covariance()
+    covariance = measured.of_rows(measured.informative()).covariance()
     own = float(np.sqrt(max(np.trace(wanted @ covariance @ wanted.T), 0.0)))
     return own if own > ROUNDED_ROOT * float(np.linalg.norm(wanted)) * measured.reach else 0.0
 
 
 def _split(measured: _Measured) -> _Split | None:
-    """Return the states that outputs do not show exactly; ``None`` where every output has noise of its own."""
+    """Return the problem of the states that are not measured exactly; ``None`` where every output has its own noise."""
     a, b, c, d = measured.a, measured.b, measured.c, measured.d
     if not len(c):
         return None

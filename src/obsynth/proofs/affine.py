@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.proofs.balls import gamma, rounded_up
-from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
+from obsynth.proofs.nonnegative_matrices import inverse_bound, spectral_radius_bound
 
 #: Terms of the series of an exponential.
 TERMS = 14

@@ -1,11 +1,10 @@
-r"""A norm in which a stable matrix contracts, proved, and what follows for sums over all time.
+r"""Proved contraction of a stable matrix in a weighted norm, and the bounds on sums over all time that follow from it.
 
 .. math::
     \rho^2 P - A^T P A > 0 \qquad (\text{continuous: } -(A + \alpha I)^T P - P (A + \alpha I) > 0)
 
 with P = Q'Q gives :math:`\|Q A^j b\| \le \rho^j \|Q b\|`, so that
 :math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral), norms rounded up.
-Nonnegative matrices: proved bounds of the spectral radius, of ``(I - M)^-1``, and of sums of powers.
 """
 
 from __future__ import annotations
@@ -25,60 +24,44 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyap
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.thin_doubling import symmetric_product
-from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
 from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import Enclosed, arb_matrix, block
 
-#: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
+#: Rates to try in turn, from the spectral radius (0) to one (1).
 TRIED_RATES = (0.5, 0.2, 0.8, 0.95)
 
-#: Digits of what is left to one: a multiple pole scatters by far more than rounding, and each machine would try, and
-#: claim bounds of, a rate of its own.
-ROOM_DIGITS = 8
-
-#: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
-OPERATIONS = 1e3
-
-#: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
-LYAPUNOV_SUMS_UP_TO, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
-
-#: From so many states on Lyapunov equations in discrete time are solved by products alone, and their root by Cholesky.
-STATES_FOR_DOUBLED_SUMS = 200
-
-#: Beside sums up to so large rounding hides no identity matrix: 1e-16 of them is 1e-7 of it.
-LARGEST_SUM = 1e9
-
-#: Where both lose it the sum is formed in so many digits, in bits, up to so many states.
-PRECISE_BITS, PRECISE_SUMS_UP_TO = 1024, 20
-
-#: The same where the rate itself is what is asked for.
+#: The same where the rate itself is wanted.
 TIGHT_RATES = (0.01, 0.1)
 
+#: Bits to which the distance from the spectral radius to one is rounded.  A multiple pole scatters by far more than
+#: rounding; without this each machine would try another rate and claim other bounds.
+ROOM_DIGITS = 8
 
-#: Solved for a rate this far from the spectral radius to the rate asked for, a Lyapunov matrix P satisfies the
-#: inequality by a share of P itself, in every direction; solved for the rate, by an identity matrix, which is lost
-#: beside a large P.
+#: Rounding errors of an entry, per order n, of a Lyapunov equation solved by Schur vectors and of its square root.
+OPERATIONS = 1e3
+
+#: Up to this many states Lyapunov equations are solved by sums first; most doublings, and the share of the sum below
+#: which the last doubling ends them.
+LYAPUNOV_SUMS_UP_TO, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
+
+#: From this many states on, Lyapunov equations in discrete time are solved by products alone, with a Cholesky root.
+STATES_FOR_DOUBLED_SUMS = 200
+
+#: Largest sum beside which rounding leaves an identity matrix intact: 1e-16 of it is 1e-7 of the identity.
+LARGEST_SUM = 1e9
+
+#: Precision, in bits, of the sum where double precision loses it, and most states for that.
+PRECISE_BITS, PRECISE_SUMS_UP_TO = 1024, 20
+
+#: Position, between the spectral radius (0) and the required rate (1), of the rate for which a Lyapunov equation is
+#: solved.  Its P then satisfies the inequality for the required rate with a margin that is a share of P in every
+#: direction.  Solved for the required rate itself, the margin is an identity matrix, which is lost beside a large P.
 SHARE_OF_THE_RATE = 0.9
 
-#: What is added to a matrix, as a share of its largest entry, so that it has a positive eigenvector.
-_SHIFTS = (1e-4, 1e-7, 1e-10, 1e-13)
-
-#: The inverse is given up where its residual is larger.
-_LARGEST_INVERSE_RESIDUAL = 0.5
-
-#: Bounds in the norm of a factor have ``1 / (1 - defect)`` of its inverse: above this they say little.
+#: Bounds in the norm of a factor grow by ``1 / (1 - defect)`` of its inverse: above this defect they are of little use.
 _LARGEST_DEFECT = 0.5
-
-
-#: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
-MOST_SUMMED_STEPS, REMAINDER_OF_SUM = 65_536, 1e-3
-
-#: Steps that are taken together; what is left is looked at when their number has grown by one in so many.
-STEPS_AT_ONCE, LOOKS = 64, 8
-
-#: A piece of an interval is at most this share of one over the norm of A; most pieces.
-NORM_PIECE, MOST_PIECES = 0.05, 1_024
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +82,7 @@ class Contraction:
 
     @property
     def roundings(self) -> float:
-        """How much, relatively, another machine's Q may be off this one: rounding times the condition of P = Q'Q."""
+        """Largest relative distance of another machine's Q from this one: rounding times the condition of P = Q'Q."""
         lengths = np.linalg.norm(self.Q, axis=0)
         condition = float(np.linalg.cond(self.Q / np.where(lengths > 0.0, lengths, 1.0))) if self.Q.size else 1.0
         slowness = self.factor if self.discrete else self.factor * self.speed
@@ -144,12 +127,12 @@ def column_norms(ball: Ball) -> FloatArray:
 def prove_contraction(
     matrix: FloatArray | Ball, *, discrete: bool, rate: float | None = None, poles: ComplexArray | None = None
 ) -> Contraction | None:
-    """Return a proved contraction of ``matrix (n, n)`` (with ``rate``, at that), or ``None`` where none is found.
+    """Return a proved contraction of ``matrix (n, n)``, at ``rate`` if one is given; ``None`` where none is found.
 
-    ``poles``: its eigenvalues, where they are known; they only say which rates are tried."""
+    ``poles``: its eigenvalues, where they are known; they only choose the rates to try."""
     ball = Ball.of(matrix)
     if rate is not None and ball.midpoint.size:
-        # Only the rate matters, not how tight the norm is: any factor that proves it will do, the quickest first.
+        # Only the rate matters, not how tight the norm is: take the first factor that proves it, quick ones first.
         return _tried(ball, rate, discrete=discrete, sums_first=False) if ball.is_finite else None
     return next(proved_contractions(ball, discrete=discrete, poles=poles), None)
 
@@ -157,7 +140,7 @@ def prove_contraction(
 def proved_contractions(
     matrix: FloatArray | Ball, *, discrete: bool, poles: ComplexArray | None = None
 ) -> Iterator[Contraction]:
-    """Yield a contraction of ``matrix (n, n)`` for each of some rates at which one is proved; see above."""
+    """Yield a contraction of ``matrix (n, n)`` for each of `TRIED_RATES` at which one is proved."""
     ball = Ball.of(matrix)
     a = ball.midpoint
     if not a.size:
@@ -195,8 +178,7 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
-    """Return a contraction at a rate; of many states those of filters that do not touch each other, beside each
-    other."""
+    """Return a contraction at a rate; a large block-diagonal matrix is proved block by block."""
     parts = _separate_parts(ball) if ball.shape[0] > LYAPUNOV_SUMS_UP_TO else []
     if len(parts) < 2:
         return _tried_whole(ball, rate, discrete=discrete, sums_first=sums_first)
@@ -209,12 +191,12 @@ def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Cont
             return None
         factor[place], inverse[place], defects[i] = contraction.Q, contraction.inverse, contraction.defect
         speed = max(speed, contraction.speed)
-    # The norm of blocks beside each other is that of the largest one.
+    # The norm of a block-diagonal matrix is that of its largest block.
     return Contraction(factor, inverse, float(np.max(defects)), rate, discrete, speed)
 
 
 def _separate_parts(ball: Ball) -> list[NDArray[np.int64]]:
-    """Return the states, in order, of each part of a matrix that is exactly zero between them."""
+    """Return the states of each diagonal block, in order, of a matrix that is exactly zero outside of these blocks."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -235,7 +217,7 @@ def _tried_whole(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -
 
 
 def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> Contraction | None:
-    """Return the contraction in the norm of a triangular factor, where it is one."""
+    """Return the contraction in the norm of a triangular factor; ``None`` where it is not proved."""
     if not np.all(np.isfinite(factor)) or np.any(np.diag(factor) == 0.0):
         return None
     inverse = np.triu(np.linalg.inv(factor))
@@ -260,11 +242,11 @@ def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> C
 
 
 def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
-    """Return an upper triangular Q with ``Q'Q`` near the sum of ``(A / rate)^k' W (A / rate)^k``, in doubled steps; in
-    continuous time of the Cayley transform's.
+    """Return an upper triangular Q with ``Q'Q`` near the sum of ``(A / rate)^k' W (A / rate)^k``, by doubling.
 
-    W is I, or where I is lost beside such a sum, that sum with W = I: beside it this one is at most as large as the
-    slowest mode is slow, however far the states are from each other.
+    In continuous time the Cayley transform of A takes the place of A / rate.  W is I.  Where rounding hides I beside
+    that sum, the sum itself becomes W and the second sum is returned: its size relative to W is limited by the
+    slowest mode, whatever the units of the states.
     """
     identity = np.eye(len(a))
     with np.errstate(all="ignore"):
@@ -286,8 +268,10 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
 
 
 def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
-    """Return the second sum of `_summed_factor` in many digits, where double precision has lost it to eigenvectors that
-    nearly coincide: whether it does is a matter of one processor's rounding."""
+    """Return the second sum of `_summed_factor` in many digits.
+
+    Double precision may lose it where eigenvectors nearly coincide, on one processor and not on another.
+    """
     n = len(a)
     if n > PRECISE_SUMS_UP_TO or not np.all(np.isfinite(a)) or not rate > 0.0:
         return None
@@ -314,7 +298,7 @@ def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray
 
 
 def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
-    """Return a triangular factor of the sum of ``(F A^k)'(F A^k)`` over all k; ``None`` where it does not settle."""
+    """Return a triangular factor of the sum of ``(F A^k)'(F A^k)`` over all k; ``None`` where it does not converge."""
     for _ in range(MOST_SUM_DOUBLINGS):
         later = factor @ power
         if not np.all(np.isfinite(later)):
@@ -357,7 +341,7 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
 
 
 def _faster_lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
-    """Return the factor for a rate between this one and the fastest that there is."""
+    """Return the factor for a rate between this one and that of the slowest mode; see `SHARE_OF_THE_RATE`."""
     bound = abscissa(a, 1.0 if discrete else 0.0)
     bound = bound if discrete else -bound
     faster = bound + SHARE_OF_THE_RATE * (rate - bound)
@@ -365,9 +349,10 @@ def _faster_lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> Fl
 
 
 def _root_of_sum(power: FloatArray) -> FloatArray | None:
-    """Return an upper triangular Q with ``Q'Q`` near ``sum A^k' A^k``, in doubled steps; ``None`` where it has none.
+    """Return an upper triangular Q with ``Q'Q`` near ``sum A^k' A^k``, by doubling; ``None`` where there is none.
 
-    Of many states that is a third of the time of Schur vectors."""
+    With many states this takes a third of the time of Schur vectors.
+    """
     total = np.eye(len(power))
     for _ in range(MOST_SUM_DOUBLINGS):
         later = symmetric_product(power.T, total @ power)
@@ -379,73 +364,3 @@ def _root_of_sum(power: FloatArray) -> FloatArray | None:
             return None if failed else np.asarray(factor)
         power = power @ power
     return None
-
-
-def spectral_radius_bound(matrix: FloatArray) -> float:
-    """Return an upper bound of the spectral radius of ``|matrix|``: a quotient of Collatz and Wielandt, rounded up."""
-    return positive_vector(matrix)[0]
-
-
-def positive_vector(matrix: FloatArray) -> tuple[float, FloatArray]:
-    """Return ``rho`` and ``w > 0`` with ``|matrix| w <= rho w`` proved; rho is near the spectral radius."""
-    values = np.abs(np.asarray(matrix, dtype=np.float64))
-    size = len(values)
-    if not size:
-        return 0.0, np.zeros(0)
-    if not np.isfinite(values).all():
-        return np.inf, np.ones(size)
-    if not values.any():
-        return 0.0, np.ones(size)
-    best, at = _positive_vector(values)
-    if best < 1.0:
-        return best, at
-    # What is added to a matrix hides its small entries, which in other units are as large as the others.
-    scaled, units = balanced_matrix(values)
-    vector = units * _positive_vector(np.abs(scaled))[1]
-    quotient = _largest_quotient(values, vector)
-    return (quotient, vector) if quotient < best else (best, at)
-
-
-def _positive_vector(values: FloatArray) -> tuple[float, FloatArray]:
-    """Return the same for a nonnegative matrix, by its eigenvectors in the units that it is in."""
-    size, tiny, largest = len(values), np.finfo(np.float64).tiny, float(values.max())
-    best, at = np.inf, np.ones(size)
-    for shift in _SHIFTS:
-        eigenvalues, vectors = np.linalg.eig(values + shift * largest)
-        vector = np.abs(vectors[:, int(np.argmax(eigenvalues.real))].real) + tiny
-        vector = vector / vector.max() + tiny
-        quotient = _largest_quotient(values, vector)
-        if quotient < best:
-            best, at = quotient, vector
-    return best, at
-
-
-def _largest_quotient(values: FloatArray, vector: FloatArray) -> float:
-    """Return an upper bound on the largest entry of ``values @ vector / vector``."""
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        quotients = rounded_up(values @ vector, len(values) + 3) / vector
-    largest = float(np.max(quotients)) * (1.0 + 4.0 * UNIT_ROUNDOFF)
-    return largest if np.isfinite(largest) and np.all(vector > 0.0) else np.inf
-
-
-def inverse_bound(matrix: FloatArray) -> FloatArray | None:
-    """Return an entrywise upper bound of ``(I - |matrix|)^-1``; `None` unless the spectral radius is proved below 1."""
-    values = np.abs(np.asarray(matrix, dtype=np.float64))
-    size = len(values)
-    if not size:
-        return np.zeros((0, 0))
-    radius, weights = positive_vector(values)
-    if not radius < 1.0:
-        return None
-    # In units in which row sums are below one, the residual of a computed inverse shrinks what it is multiplied by.
-    scaled = values * weights / weights[:, None]
-    near = np.abs(np.linalg.inv(np.eye(size) - scaled))
-    residual = np.abs(np.eye(size) - (near - scaled @ near))
-    residual = residual + gamma(2 * size + 8) * (near + scaled @ near)
-    norm = float(rounded_up(residual.sum(axis=1), size + 4).max())
-    if not norm < _LARGEST_INVERSE_RESIDUAL:
-        return None
-    # inverse = near (I - residual)^-1 = near (I + residual + ...); no entry of residual^k is larger than norm^k.
-    more = norm / (1.0 - norm) * near.sum(axis=1, keepdims=True)
-    bound = rounded_up(near + more, 2 * size + 8) * (1.0 + 8.0 * UNIT_ROUNDOFF)
-    return np.asarray(bound * weights[:, None] / weights * (1.0 + 8.0 * UNIT_ROUNDOFF))

@@ -17,18 +17,19 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only, remembered
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
-from obsynth.proofs.contraction import (
-    LOOKS,
-    MOST_PIECES,
-    MOST_SUMMED_STEPS,
-    NORM_PIECE,
-    REMAINDER_OF_SUM,
-    STEPS_AT_ONCE,
-    Contraction,
-)
+from obsynth.proofs.contraction import Contraction
 from obsynth.proofs.products import exponential
 
-#: More than the square root of what underflows in a square.
+#: Most steps that are summed one by one, and the largest share of the sum that the remaining ones may then have.
+MOST_SUMMED_STEPS, REMAINDER_OF_SUM = 65_536, 1e-3
+
+#: Steps of one block; the remainder is bounded again when the number of blocks has grown by one in so many.
+BLOCK_STEPS, BLOCKS_PER_CHECK = 64, 8
+
+#: Largest length of a piece of an interval, as a share of one over the norm of A; most pieces.
+NORM_PIECE, MOST_PIECES = 0.05, 1_024
+
+#: Above the square root of the largest number whose square underflows.
 SQRT_UNDERFLOW = 2.0**-510
 
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
@@ -71,9 +72,9 @@ def peak_sums(
         products = np.abs(block @ driven)
         terms.append(products if each else _norms(products))
         total, collected = total + np.sum(terms[-1], axis=0), collected + np.sum(np.abs(block), axis=0)
-        done = STEPS_AT_ONCE * len(terms) >= max(most, least)
-        if done or (STEPS_AT_ONCE * len(terms) >= least and len(terms) >= looked):
-            looked = len(terms) + len(terms) // LOOKS + 1
+        done = BLOCK_STEPS * len(terms) >= max(most, least)
+        if done or (BLOCK_STEPS * len(terms) >= least and len(terms) >= looked):
+            looked = len(terms) + len(terms) // BLOCKS_PER_CHECK + 1
             after = contraction.factor * _row_norms(
                 contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each
             )
@@ -97,9 +98,9 @@ def peak_sums(
 
 def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return rows ``(p, n)`` moved zero times and more, ``(steps, p, n)``, and moved once more than the last."""
-    moved = np.empty((STEPS_AT_ONCE, *rows.shape))
+    moved = np.empty((BLOCK_STEPS, *rows.shape))
     moved[0] = rows
-    for i in range(1, STEPS_AT_ONCE):
+    for i in range(1, BLOCK_STEPS):
         np.matmul(moved[i - 1], moving, out=moved[i])
     return moved, moved[-1] @ moving
 

@@ -23,7 +23,8 @@ from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.proofs.balls import gamma, rounded_up
-from obsynth.proofs.contraction import Contraction, inverse_bound
+from obsynth.proofs.contraction import Contraction
+from obsynth.proofs.nonnegative_matrices import inverse_bound
 from obsynth.proofs.peak_sums import absolute_gains
 from obsynth.verification.error_system import contraction_of
 

@@ -16,7 +16,8 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import rounded_up
-from obsynth.proofs.contraction import REMAINDER_OF_SUM, proved_contractions
+from obsynth.proofs.contraction import proved_contractions
+from obsynth.proofs.peak_sums import REMAINDER_OF_SUM
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.disturbance_gains import (

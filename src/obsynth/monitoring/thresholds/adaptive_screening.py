@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.contraction import inverse_bound
+from obsynth.proofs.nonnegative_matrices import inverse_bound
 from obsynth.simulation.benches import Runs
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
 from obsynth.verification.over_tolerances.adaptive_recursion import (

@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma
-from obsynth.proofs.contraction import positive_vector
+from obsynth.proofs.nonnegative_matrices import positive_vector
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure
 from obsynth.verification.over_tolerances.responses import (
     OUTWARD,

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma
-from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
+from obsynth.proofs.nonnegative_matrices import inverse_bound, spectral_radius_bound
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure
 
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
