@@ -194,6 +194,9 @@ def test_a_picture_of_one_s_own_data(design, frame):
     panels = plot_data(run, design=design, axes=axes)
     labels = [panel.get_ylabel() for panel in panels]
     assert labels == ["level (m)", "flow", "valve", "leak (kg/s)", "residuals (kg/s)", "statistic"]
+    assert design.plant.input_names == ("valve",)
+    drawn = [panel.get_lines()[0].get_label() for panel in panels[:3]]
+    assert drawn == ["measured", "measured", "input"]
     (estimate,) = [line for line in panels[3].get_lines() if line.get_label() == "estimate"]
     assert np.array_equal(estimate.get_ydata(), run.table["fhat[leak]"])
     assert np.array_equal(estimate.get_xdata(), run.table["time of fhat[leak]"])

@@ -237,8 +237,8 @@ class GuaranteedTest(ObserverDesign):
         Parameters
         ----------
         estimates : Estimates
-            What the observer said over a record, from its start.  The interval is of a fault of the stated course; of
-            a ``step`` it holds at the row at which the step is ``after`` samples old.
+            Estimates of the observer over a record, from its start.  The interval is that of a fault of the stated
+            course; of a ``step`` it is valid at the row at which the step is ``after`` samples old.
         """
         row = self.residual(estimates)
         limits = self.limits(len(row))
@@ -251,7 +251,7 @@ class GuaranteedTest(ObserverDesign):
         Parameters
         ----------
         estimates : Estimates
-            What the observer said over a record, from its start.
+            Estimates of the observer over a record, from its start.
         """
         self._single("a residual")
         row = np.hstack([estimates.faults, estimates.residuals])[..., 0].astype(np.float64)
@@ -265,7 +265,7 @@ class GuaranteedTest(ObserverDesign):
         Parameters
         ----------
         estimates : Estimates
-            What the observer said over a record, from its start.
+            Estimates of the observer over a record, from its start.
         """
         row = np.nan_to_num(self.residual(estimates))
         return np.maximum.accumulate(np.abs(row) > self.limits(len(row)))

@@ -200,9 +200,10 @@ class _Drawing:
     design: Any
 
     def outputs(self, panel: Axes, name: str) -> None:
-        """Draw a measured output with its estimate."""
+        """Draw a known input, or a measured output with its estimate."""
         measured: Any = self.run.measured
-        panel.plot(measured["time"], measured[name], label="measured", **MEASURED_STYLE)
+        is_input = self.design is not None and name in self.design.plant.input_names
+        panel.plot(measured["time"], measured[name], label="input" if is_input else "measured", **MEASURED_STYLE)
         column = f"xhat[{name}]"
         if column in self.table:
             panel.plot(self._times(column), self.table[column], label="estimate", **ESTIMATE_STYLE)

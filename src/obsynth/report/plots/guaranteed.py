@@ -104,21 +104,21 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
 
 @arguments_checked
 def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes | None = None) -> Axes:
-    """Plot the interval in which a guaranteed test says the fault lies, and where it alarms.
+    """Plot the proved interval of the fault from a guaranteed test, and its first alarm.
 
     Parameters
     ----------
     design : ObserverDesign
         By `obsynth.guaranteed_test`.
     estimates : Estimates
-        What its observer said over a record, from its start.
+        The observer's estimates over a record, from its start.
     axes : Axes, optional
         Where; new ones by default.
 
     Returns
     -------
     Axes
-        Residual with the threshold on both sides of it, against seconds; alarms are shaded from the first on.
+        Residual, and the interval of one threshold on both sides of it, against seconds; a line at the first alarm.
 
     Raises
     ------
@@ -148,12 +148,12 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     low, high = test.interval(estimates)
     seconds = np.arange(len(low)) * test.observer.dt
-    panel.fill_between(seconds, low, high, label="interval", **BAND_STYLE)
+    panel.fill_between(seconds, low, high, label="proved interval of the fault", **BAND_STYLE)
     panel.plot(seconds, test.residual(estimates), label="residual", **RESIDUAL_STYLE)
     panel.axhline(0.0, color="0.4", linewidth=0.8)
     alarms = np.flatnonzero(test.alarms(estimates))
     if alarms.size:
-        panel.axvline(float(seconds[alarms[0]]), color="#B2182B", linestyle=":", label="alarm")
+        panel.axvline(float(seconds[alarms[0]]), color="#B2182B", linestyle=":", label="first alarm")
     return finish(panel, with_unit(test.fault, test.plant.units))
 
 
