@@ -207,10 +207,10 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
         assert fragment in capsys.readouterr().err
         assert main(["run", "--gains", str(gains), "--data", "nowhere.csv"]) == 2
         printed = capsys.readouterr()
-        assert (printed.out, "nowhere.csv cannot be read" in printed.err) == ("", True)
+        assert (printed.out, "nowhere.csv does not exist" in printed.err) == ("", True)
         assert {path.name for path in Path().iterdir()} <= {"log.csv", "folder", "folder.csv", "bad.parquet", "log.txt"}
 
-    refused("log.csv cannot be read: No such file")
+    refused("log.csv does not exist.")
     log(*ROWS)
     Path("folder.csv").mkdir()
     refused("folder.csv is a folder", data="folder.csv")

@@ -156,26 +156,15 @@ def wang2015(
     constraints = _constraints_45(data, written, (P, Y, gamma_squared), weight, margin, free=convex.free_weight)
     every_condition_holds = all(condition.holds for condition in existence)
     if not every_condition_holds and _hides_a_mode(written.A1, np.vstack([written.C1, data.W @ data.C @ written.X])):
-        # A P that is nothing in a mode that no gain moves would be within the tolerance of any solver.
+        # Any solver's tolerance admits a P that is zero in a mode that no gain moves: demand a stabilising gain.
         positive, stable = atoms.some_gain_stabilises(written.A1, 1.0, written.C1)
         constraints |= {"Q": positive, "some gain is stable": stable}
 
-    def gains(values: Values) -> dict[str, FloatArray]:
-        R = written.R0 + written.X @ np.linalg.solve(values["P"], values["Y"]) @ written.innovation_rows  # (63)
-        W_free = data.W + values["Vw"] @ data.V.T if "Vw" in values else data.W
-        L = data.L0 + R  # (60)
-        return {"T": data.T, "N": data.N, "L": L, "W": W_free, "Psi": data.Psi, "Upsilon": data.Upsilon, "R": R}
-
-    def without_gain() -> SmallerProblem:
-        from obsynth.conditions.wang_without_gain import WrittenIn, wang_without_gain
-
-        level = None if gamma is None else gamma_squared
-        form = WrittenIn(written.X, written.R0, written.innovation_rows, data.V)
-        return wang_without_gain(convex, variables, level, form)
-
     goal = cp.Minimize(gamma_squared if gamma is None else 0)
-    # A margin of the user's is one of these coordinates, and without a filter there are no others.
-    smaller = without_gain if margin == MARGIN and every_condition_holds else None
+    # A margin of the user's is one in these coordinates; where a condition fails the smaller problem has no solution.
+    level = None if gamma is None else gamma_squared
+    has_smaller = margin == MARGIN and every_condition_holds
+    smaller = partial(_without_gain, data, written, convex, variables, level) if has_smaller else None
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
         lmi.semidefinite_problem(goal, list(constraints.values()), smaller=smaller),
@@ -184,10 +173,28 @@ def wang2015(
         _named_data(data, written),
         constraints,
         partial(_existence, existence, convex, gamma),
-        gains,
+        partial(_gains, data, written),
         design_of("wang2015", plant, convex),
         weight=weight if convex.free_weight else None,
     )
+
+
+def _gains(data: _PaperData, written: _WrittenForm, values: Values) -> dict[str, FloatArray]:
+    """Return the gains of (23) from the values of P and Y, and of ``Vw`` where the weight is free."""
+    R = written.R0 + written.X @ np.linalg.solve(values["P"], values["Y"]) @ written.innovation_rows  # (63)
+    W = data.W + values["Vw"] @ data.V.T if "Vw" in values else data.W
+    L = data.L0 + R  # (60)
+    return {"T": data.T, "N": data.N, "L": L, "W": W, "Psi": data.Psi, "Upsilon": data.Upsilon, "R": R}
+
+
+def _without_gain(
+    data: _PaperData, written: _WrittenForm, convex: GainProblem, variables: dict[str, Any], level: Any
+) -> SmallerProblem:
+    """Return the inequality without Y (projection lemma), of half the size; ``level``: a given gamma squared."""
+    from obsynth.conditions.wang_without_gain import WrittenIn, wang_without_gain
+
+    form = WrittenIn(written.X, written.R0, written.innovation_rows, data.V)
+    return wang_without_gain(convex, variables, level, form)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,8 +54,8 @@ class FileKind:
         named = next((group for group in SUFFIXES if target.suffix.lower() in group), None)
         if self.suffix is not None and named is not None and self.suffix not in named:
             raise SpecError(
-                f"{target} would hold {self.name}, which is no {target.suffix} file: give it a name that ends in "
-                f"{self.suffix}.",
+                f"{target}: obsynth writes {self.name} as {self.suffix}, not as {target.suffix}: give it a name that "
+                f"ends in {self.suffix}.",
                 path=str(target),
             )
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from obsynth.specs.schema_plants import EntrySection, PlantReference, PlantSection
     from obsynth.specs.schema_sections import DAESection, TimeVaryingSection
 
-_Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem, DAEModel)
+_Made = TypeVar("_Made")
 
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
@@ -77,8 +77,8 @@ def built_plant(
     return plant
 
 
-def placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
-    """Return the plant that is made; an error gets its place in the document."""
+def placed(make: Callable[[], _Made], source: Path, prefix: str) -> _Made:
+    """Return the result of ``make``; an error gets its place in the document."""
     try:
         return make()
     except SpecError as error:

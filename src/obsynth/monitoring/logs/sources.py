@@ -206,8 +206,7 @@ def check_suffix(path: Path, suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> None
 def require_readable_log(path: Path) -> Iterator[None]:
     """Turn what can be wrong with a file into errors that name it."""
     try:
-        if path.exists():
-            input_file(path)
+        input_file(path)
         yield
     except SpecError:
         raise

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.methods.registry import error_model
 from obsynth.monitoring.thresholds.cross_validation import (
+    HealthyTime,
     healthy_time,
     held_out,
     levels_of_other_parts,
@@ -79,19 +80,49 @@ def thresholds_from_rows(
     sensor_drift: float = 0.0,
     missing: str = "",
 ) -> LearnedThresholds:
-    """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
-    does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
-    ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
-    instead; ``like``: thresholds of which columns and directions are taken; ``logs``: which rows are of one log each;
-    ``initial_covariance``: that of the states at a start anywhere; ``repeats``: from which equal sample on outputs
-    count as not measured; ``validated``: whether the levels are those that
-    rows keep which are not learned from; ``drifts``: what drifts of the sensors do that are allowed for, of so many
-    deviations, ``sensor_drift``; ``missing``: what a log with too few rows lacks, as a sentence.
+    """Return thresholds that are learned from rows without faults.
 
-    Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
-    filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
-    that the estimates follow leaves nothing in these: where it is known what each sample says of the faults, changes of
-    these are looked for beside them, and the estimates in units of their deviations, which follow from the same.
+    The residuals alone are watched where the fault estimates have a longer memory than the rows can show, or nearly
+    follow from the residuals.  A fault that the estimates follow leaves no trace in the residuals.  With ``scores``,
+    changes of the faults are therefore tested beside the residuals, and so are the estimates in units of their
+    deviations, which follow from the scores.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        The design whose estimates and residuals are watched.
+    rows : FloatArray
+        ``(n, m)``: all columns that may be watched; NaN where a value is missing.
+    every : float
+        Mean number of rows between false alarms.
+    dt : float, seconds
+        Time between rows.
+    seed : int, optional
+        Seed of simulated levels.
+    pairs : WrongPairs, optional
+        Pairs of wrong samples that are missing in ``rows`` but cause alarms.
+    innovation : float, optional
+        Size of the innovations, relative to the deviations that the observer states.
+    scores : Scores, optional
+        Information of each row on the faults, where it is known.
+    outlier_sizes : FloatArray, optional
+        Sizes of outliers, in place of those of the design.
+    like : LearnedThresholds, optional
+        Thresholds whose columns and directions are taken.
+    logs : sequence of slice, optional
+        Rows of each log.
+    initial_covariance : FloatArray, optional
+        Covariance of the states at any start of the observer.
+    repeats : FloatArray, optional
+        Number of equal samples after which an output counts as not measured.
+    validated : bool, optional
+        Whether levels come from rows that were held out of the fit.
+    drifts : SensorDrifts, optional
+        Effects of the sensor drifts that must not cause alarms.
+    sensor_drift : float, optional
+        Size of these drifts, in deviations.
+    missing : str, optional
+        Sentence on what a log with too few rows lacks.
     """
     names, faults = watched_names(design), len(design.observer.fault_names)
     seldom = seldom_known(rows, faults) if like is None else [names.index(name) for name in like.seldom]
@@ -107,11 +138,7 @@ def thresholds_from_rows(
     centres, scales = rows[complete, :faults].mean(axis=0), rows[complete, :faults].std(axis=0)
     if scores is not None:
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
-    directions = (
-        signatures(design, chosen, np.sqrt(np.nanvar(x, axis=0)))
-        if like is None
-        else (like.statistics.signatures, like.statistics.signature_names)
-    )
+    directions = _directions(design, chosen, x, like)
     statistics = Statistics(model, *directions, estimates=() if scores is None else names[:faults])
     lasting, extrapolated = 0.0, False
     if conformal:
@@ -123,10 +150,7 @@ def thresholds_from_rows(
     if drifts is not None:
         size = offset_size(statistics, x, logs)
         statistics, levels = with_room_for_drifts(statistics, levels, drifts, chosen, size)
-    held, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
-    time = healthy_time(levels, held, every_other, room)
-    judged = held if validated else not_held_out(x, statistics, scores)
-    levels = room * levels_of_other_parts(levels, judged, every_other)
+    levels, time = _validated_levels(levels, x, statistics, scores, logs, every_other, validated=validated)
     return LearnedThresholds(
         tuple(names[i] for i in chosen),
         statistics,
@@ -152,6 +176,32 @@ def thresholds_from_rows(
         repeats=None if repeats is None else read_only(repeats),
         sensor_drift=0.0 if drifts is None else sensor_drift,
     )
+
+
+def _directions(
+    design: ObserverDesign, chosen: list[int], x: FloatArray, like: LearnedThresholds | None
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the directions of faults in the ``chosen`` columns x ``(n, k)``, or those of ``like``, and their names."""
+    if like is not None:
+        return like.statistics.signatures, like.statistics.signature_names
+    return signatures(design, chosen, np.sqrt(np.nanvar(x, axis=0)))
+
+
+def _validated_levels(
+    levels: FloatArray,
+    x: FloatArray,
+    statistics: Statistics,
+    scores: Scores | None,
+    logs: Sequence[slice],
+    every: float,
+    *,
+    validated: bool,
+) -> tuple[FloatArray, HealthyTime]:
+    """Return levels with one false alarm per ``every`` rows in other parts and logs, and the share of time in alarm."""
+    held, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
+    time = healthy_time(levels, held, every, room)
+    parts = held if validated else not_held_out(x, statistics, scores)
+    return room * levels_of_other_parts(levels, parts, every), time
 
 
 def _checked_count(complete: NDArray[np.bool_], missing: str) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import path_of, read_text
+from obsynth.files.inputs import input_file, path_of, read_text
 from obsynth.numerics.arguments import arguments_checked, number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -94,9 +92,7 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     >>> plant.A.tolist()
     [[-1.0]]
     """
-    source = path_of(path)
-    if not source.exists():
-        raise SpecError(f"{source} cannot be read: {os.strerror(errno.ENOENT)}.", path=str(source))
+    source = input_file(path_of(path))
     suffix = source.suffix.lower()
     if suffix == ".mat":
         return from_matlab(source, **plant)
