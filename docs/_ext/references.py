@@ -248,7 +248,7 @@ def _names(action: argparse.Action) -> str:
 
 
 def _setting(name: str, settings: dict[str, Any]) -> str:
-    value = settings.get("metavar") or "\\|".join(map(str, settings.get("choices") or ()))
+    value = settings.get("metavar") or "|".join(map(str, settings.get("choices") or ()))
     return f"`{name}{' ' + value if value else ''}`"
 
 
@@ -257,5 +257,6 @@ def _help(action: argparse.Action) -> str:
 
 
 def _text(text: str) -> str:
-    """Return a help text as Markdown: percent signs are doubled there, and `<...>` would be HTML."""
-    return re.sub(r"(<[^>]*>)", r"`\1`", text.replace("%%", "%").replace("*", r"\*"))
+    """Return a help text as Markdown: percent signs are doubled there, `<...>` would be HTML and `--` a dash."""
+    text = text.replace("%%", "%").replace("*", r"\*")
+    return re.sub(r"`[^`]*`|<[^>]*>|--[a-z][\w-]*", lambda hit: hit[0] if hit[0][0] == "`" else f"`{hit[0]}`", text)

@@ -1,7 +1,8 @@
-"""The reference of a spec's keys explains every key of the schema, and its examples are YAML."""
+"""The references of the site: every key of the schema is explained with an example that is YAML; options are code."""
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,3 +55,14 @@ def test_examples_are_yaml_and_meanings_are_sentences(spec_keys) -> None:
             YAML(typ="safe", pure=True).load(f"{key}: {example}")
             assert meaning.endswith("."), (section, key)
             assert not unit.endswith("."), (section, key)
+
+
+def test_options_in_the_reference_of_commands_are_code_that_can_be_copied(spec_keys) -> None:
+    from references import command_reference
+
+    page = re.sub(r"```.*?```", "", command_reference(), flags=re.DOTALL)
+    assert "`--map SIGNAL=COLUMN`" in page
+    # Outside of code two hyphens would be printed as a dash, and a bar of a choice with the backslash of the table.
+    assert re.findall(r".{0,30}--[a-z][^|]{0,20}", re.sub(r"`[^`]*`", "", page)) == []
+    assert "`--outliers gate\\|huber\\|none`" in page
+    assert "\\\\|" not in page

@@ -15,8 +15,9 @@ import obsynth
 from obsynth.cli.main import main
 from obsynth.monitoring.verbs.data_arguments import own_tolerances
 from obsynth.report.designs import design_warnings, followed_steps
-from obsynth.report.plots.frequency import _state_response, fault_gains
+from obsynth.report.plots.frequency import fault_gains
 from obsynth.report.summary import summary
+from obsynth.verification.output_responses import _state_response
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 

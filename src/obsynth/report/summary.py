@@ -208,7 +208,7 @@ def _engine(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     """Yield how the gains were computed, where a method has several ways, and how to have the other one."""
     engine, inequality = design.solver.get("engine"), _INEQUALITIES.get(design.method)
     if engine == "riccati" and inequality:
-        yield "engine", f"Riccati equations; {inequality} verified with its P (by Clarabel: engine lmi)"
+        yield "engine", f"Riccati equations; {inequality} verified with P (engine: lmi uses Clarabel)"
     elif engine == "lmi":
         runs = design.solver.get("runs", ())
         names = dict.fromkeys(str(run["solver"]) for run in runs if "settings" in run and "solver" in run)
