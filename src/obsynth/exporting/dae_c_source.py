@@ -1,7 +1,7 @@
 """Observers of nonlinear DAEs, and thresholds over tolerances, as C99: templates filled with sizes and tables.
 
 CasADi writes the equations of a DAE; the loop of Newton around them, its damping and its homotopy are those of
-`obsynth.observers.dae.c_code`.
+`obsynth.observers.nonlinear.c_code`.
 """
 
 from __future__ import annotations

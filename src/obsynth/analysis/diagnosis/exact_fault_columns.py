@@ -1,6 +1,6 @@
 """Detectability of faults in rational arithmetic, for plants with stated numbers.
 
-The reduction of `obsynth.analysis.diagnosis.reduction` over the rational numbers: no tolerance, so no gap.
+The decisions of `obsynth.analysis.diagnosis.fault_columns` over the rational numbers: no tolerance, so no gap.
 """
 
 from __future__ import annotations
