@@ -59,7 +59,7 @@ _OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class ClaimMeaning:
-    """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED`: none can."""
+    """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED_BY_SEARCH`: none can."""
 
     unit: str  # empty: dimensionless
     meaning: str
