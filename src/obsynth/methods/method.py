@@ -59,7 +59,10 @@ _OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class ClaimMeaning:
-    """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED_BY_SEARCH`: none can."""
+    """A number that a method may claim, and the ``row`` that checks it.
+
+    Where no row can, ``row`` is `obsynth.verification.claims.STATED_BY_SEARCH`.
+    """
 
     unit: str  # empty: dimensionless
     meaning: str
