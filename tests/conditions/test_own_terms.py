@@ -12,6 +12,7 @@ import pytest
 import obsynth
 from obsynth import conditions
 from obsynth.conditions import lmi
+from obsynth.conditions.options import SEMIDEFINITE_SOLVERS
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 
@@ -196,3 +197,12 @@ def test_installed_solvers_are_those_of_cvxpy_that_take_matrices():
     found = lmi.semidefinite_solvers()
     assert {"CLARABEL", "SCS"} <= set(found) <= set(cp.installed_solvers())
     assert not {"HIGHS", "OSQP", "SCIPY"} & set(found)
+
+
+def test_solvers_that_a_gain_set_may_name_are_all_those_that_cvxpy_knows():
+    """Installed here or not: a gain set may come from another machine.  Other versions of cvxpy know fewer or more."""
+    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
+
+    cones_of = {name: {cone.__name__ for cone in each.SUPPORTED_CONSTRAINTS} for name, each in SOLVER_MAP_CONIC.items()}
+    assert not {name for name in SEMIDEFINITE_SOLVERS if name in cones_of and not cones_of[name] & {"PSD", "SvecPSD"}}
+    assert {"CLARABEL", "SCS", "MOSEK", "CVXOPT", "COPT", "SDPA"} <= set(SEMIDEFINITE_SOLVERS)

@@ -42,7 +42,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "notes.*": WORDS,
         "solver.*": SEARCH,
         "report.*": "made again by verify",
-        "options.solver*": SEARCH,
+        "options.solver_options": SEARCH,
         "options.engine": SEARCH,
         "options.constraints": FUNCTIONS,
         "options.objective": FUNCTIONS,
@@ -251,6 +251,50 @@ def test_options_of_a_region_observer_are_those_that_it_runs_with(option: str, e
     document = document_of("region-observer")
     assert passes(document, ("options", option), document["design"]["options"][option])
     assert not passes(document, ("options", option), edit)
+
+
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("method", OWN)
+def test_an_option_that_the_method_does_not_have_is_refused(method: str) -> None:
+    document = document_of(method)
+    assert passes(document, ("name",), "another name")
+    assert not passes(document, ("options", "colour"), "red")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "edit"),
+    [
+        ("fault-estimation-filter", ("options", "solver"), "CLARABELx"),
+        ("fault-estimation-filter", ("options", "engine"), "magic"),
+        ("fault-estimation-filter", ("options", "S"), [[1.0]]),
+        ("fault-estimation-filter", ("options", "S"), "x"),
+        ("fault-estimation-filter", ("options", "constraints"), "x"),
+        ("fault-estimation-filter", ("options", "objective"), 1.5),
+        ("fault-estimation-filter", ("solver", "engine"), "magic"),
+        ("pd-observer", ("options", "solver"), "HIGHS"),
+        ("pd-observer", ("options", "adaptation_gain"), "x"),
+        ("pd-observer", ("solver", "runs", 0, "solver"), "CLARABELx"),
+        ("ui-pi-observer", ("options", "solver"), ""),
+        ("ui-pi-observer", ("options", "objective"), "beauty"),
+        ("ui-pi-observer", ("options", "noise"), {"measurement": {"y3": 1.0}}),
+        ("functional-filter", ("options", "noise"), {"y1": 1.0, "y3": 1.0}),
+        ("region-observer", ("options", "goal"), "beauty"),
+        ("region-observer", ("options", "solver"), "CLARABELx"),
+    ],
+)
+@pytest.mark.one_in(4)
+def test_options_that_nobody_claims_are_those_that_a_design_can_have(method: str, path: tuple[Any], edit: Any) -> None:
+    """A reader is shown with which options and by which solver a design was made."""
+    document = document_of(method)
+    assert passes(document, ("name",), "another name")
+    assert not passes(document, path, edit)
+
+
+def test_names_of_constraints_and_of_functions_may_stand_for_them() -> None:
+    document = document_of("fault-estimation-filter")
+    assert passes(document, ("options", "constraints"), ["small"])
+    assert passes(document, ("options", "objective"), "a function, trace_of_P")
+    assert passes(document, ("options", "solver"), "MOSEK")
 
 
 def test_modes_that_no_gain_moves_are_computed_only_where_a_row_fails_without_them() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.conditions import lazy_cvxpy as cp
-from obsynth.conditions.options import ChosenSolver
+from obsynth.conditions.options import SEMIDEFINITE_SOLVERS, ChosenSolver
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 
@@ -42,7 +42,7 @@ def semidefinite_solvers() -> tuple[str, ...]:
     cones_of = {
         name: {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
         for name in cp.installed_solvers()
-        if name in SOLVER_MAP_CONIC
+        if name in SEMIDEFINITE_SOLVERS and name in SOLVER_MAP_CONIC
     }
     # Newer versions know a cone of scaled triangles besides that of matrices.
     return tuple(name for name, cones in cones_of.items() if cones & {"PSD", "SvecPSD"})

@@ -22,6 +22,14 @@ SolverName: TypeAlias = Annotated[Any, WrittenAs("solver")]
 
 SolverOptions: TypeAlias = Annotated[Any, WrittenAs("solver options")]
 
+#: Solvers of cvxpy that take semidefinite constraints, whether installed or not: a gain set names no other.
+SEMIDEFINITE_SOLVERS = (
+    "CLARABEL", "COPT", "COSMO", "CVXOPT", "DIFFCP", "KNITRO", "MOREAU", "MOSEK", "SCS", "SDPA"
+)  # fmt: skip
+
+#: How what is stored of a function begins.
+FUNCTION_TEXT = "a function, "
+
 #: Values satisfy a constraint that they violate by no more than this share of their own size: solvers stop at 1e-8.
 VIOLATION_SHARE = 1e-6
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
+from obsynth.conditions.options import FUNCTION_TEXT
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import field_types, problem_with, without_axes
 from obsynth.numerics.arrays import FloatArray
@@ -130,6 +131,8 @@ class Method(ABC):
     over_scenario: ClassVar[bool] = False
     #: Whether its designs are models without feedback: nothing is claimed of their stability, as the verdict says.
     open_loop: ClassVar[bool] = False
+    #: What a design of it stores among its options beside these.
+    recorded: ClassVar[frozenset[str]] = frozenset()
     #: Which of the options decay, region and poles are about the eigenvalues of its linear observers.
     placed: ClassVar[frozenset[str]] = frozenset()
     #: Values of required options, for questions that do not depend on them.
@@ -166,6 +169,10 @@ class Method(ABC):
 
     def require_stated(self, plant: Any) -> None:
         """Raise an error where a design needs what neither the plant nor the options state."""
+        return None
+
+    def require_fitting(self, plant: Any) -> None:
+        """Raise `SpecError` where options name signals that a plant does not have, or are matrices of other sizes."""
         return None
 
     def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
@@ -253,7 +260,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, LMIRegion):
         return list(value.parts) or {"L": value.L.tolist(), "M": value.M.tolist()}
     if callable(value):
-        return f"a function, {getattr(value, '__name__', type(value).__name__)}"
+        return f"{FUNCTION_TEXT}{getattr(value, '__name__', type(value).__name__)}"
     if isinstance(value, Mapping):
         return {str(key): plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray):

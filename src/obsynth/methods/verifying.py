@@ -9,10 +9,10 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.method import Method
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.methods.stored_options import wrong_options
 from obsynth.numerics.arguments import arguments_checked, field_types, is_number, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
@@ -139,19 +139,10 @@ def _existence_rows(method: type[Method], design: ObserverDesign, known: tuple[C
 
 
 def _option_rows(method: type[Method], design: ObserverDesign) -> Iterator[Check]:
-    """Yield the checks of the stored options: they are valid for the method, and the design keeps the limits they set.
-
-    Recursive and nonlinear observers store options in forms of their own, which the checks of their methods read.
-    """
-    # A design stores only the names of these functions.
-    fields = field_types(method).keys() - {"constraints", "objective"}
-    stored = {name: value for name, value in design.options.items() if name in fields}
-    try:
-        if isinstance(design.observer, (LinearObserver, ScheduledObserver)):
-            method.of(stored)
-    except SpecError as error:
-        reasons = [str(problem) for problem in error.problems] or [str(error)]
-        yield nothing_wrong("options", "the options are those of the method", reasons, source="options")
+    """Yield the checks of the stored options: the method takes them, and the design keeps their limits."""
+    wrong = [*wrong_options(method, design)]
+    if wrong:
+        yield nothing_wrong("options", "the options are those of the method", wrong, source="options")
         return
     yield from requested_rows(design, method.requested_limits(design), method.placed, method.fixed_modes)
 

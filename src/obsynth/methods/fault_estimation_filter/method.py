@@ -19,7 +19,15 @@ from obsynth.conditions.options import (
 )
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
+from obsynth.numerics.arguments import (
+    FewSamples,
+    OpenUnitInterval,
+    Positive,
+    WrittenAs,
+    checked_value,
+    require_shape,
+    shown,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -178,6 +186,7 @@ class FaultEstimationFilter(Method):
     }
     witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking", *WITNESSES}
     averaged: ClassVar[bool] = True
+    recorded: ClassVar[frozenset[str]] = frozenset({"from_gains", "indexes"})
     placed: ClassVar[frozenset[str]] = frozenset({"decay", "region"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
@@ -246,6 +255,12 @@ class FaultEstimationFilter(Method):
     def own_inequality(self) -> bool:
         """Whether (45) is asked for with something else in it."""
         return bool(own_terms(self)) or self.region is not None or self.decay is not None
+
+    def require_fitting(self, plant: DescriptorSystem | PolytopicSystem) -> None:
+        """Raise `SpecError` where S has another size than the plant's states and outputs ask for."""
+        if self.S is not None:
+            nx, ny = len(plant.state_names), len(plant.output_names)
+            require_shape(as_matrix(self.S, "S").shape, (nx, nx + ny), "S")
 
     def existence(self, plant: DescriptorSystem | PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""

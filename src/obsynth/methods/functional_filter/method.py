@@ -133,6 +133,7 @@ class FunctionalFilter(Method):
     )
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "faults under the weakest conditions"})
 
+    recorded: ClassVar[frozenset[str]] = frozenset({"fault_model_in_words", "fault_rate_found"})
     placed: ClassVar[frozenset[str]] = frozenset({"decay", "poles"})
 
     faults: Annotated[Any, WrittenAs("texts")] = None
@@ -180,6 +181,11 @@ class FunctionalFilter(Method):
         if self.noise is None:
             return None
         return _by_name(self.noise, plant.output_names, "noise", missing=None)
+
+    def require_fitting(self, plant: DescriptorSystem) -> None:
+        """Raise `SpecError` where noise or rates name signals that a plant does not have."""
+        self.sensor_noise(plant)
+        self.rates(plant)
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, one or two for each fault asked for."""

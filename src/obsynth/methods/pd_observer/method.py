@@ -170,6 +170,7 @@ class PdObserver(Method):
     witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
     imposed: ClassVar[frozenset[str]] = frozenset({"decay"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
+    recorded: ClassVar[frozenset[str]] = frozenset({"from_gains"})
     placed: ClassVar[frozenset[str]] = frozenset({"decay", "region"})
 
     theorem: Literal[1, 2] = 1
@@ -245,6 +246,10 @@ class PdObserver(Method):
         from obsynth.methods.pd_observer.given_gains import checked_adaptation_gain
 
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
+
+    def require_fitting(self, plant: DescriptorSystem) -> None:
+        """Raise `SpecError` where the adaptation gain has another size."""
+        self.gain_matrix(plant.nf)
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""

@@ -169,6 +169,7 @@ class UiPiObserver(Method):
     )
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
 
+    recorded: ClassVar[frozenset[str]] = frozenset({"fault_model_in_words", "from_gains"})
     placed: ClassVar[frozenset[str]] = frozenset({"decay", "region", "poles"})
 
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
@@ -286,6 +287,10 @@ class UiPiObserver(Method):
             **self.as_plain(),
             "poles": None if listed is None else [[pole.real, pole.imag] for pole in listed],
         }
+
+    def require_fitting(self, plant: DescriptorSystem | PolytopicSystem) -> None:
+        """Raise `SpecError` where noise weights name outputs that a plant does not have."""
+        self.checked_noise(plant.output_names)
 
     def existence(self, plant: DescriptorSystem | PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; several may fail."""
