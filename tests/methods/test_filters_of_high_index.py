@@ -3,11 +3,15 @@ continuous ones, whose outputs show derivatives."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
 import obsynth
+from obsynth.errors import counted
+from obsynth.results.design import Certificate
 from obsynth.verification.invisible_faults import proved_least
 from obsynth.verification.seen_outputs import Setting, seen_plant
 
@@ -22,6 +26,9 @@ LATER_NOISE = obsynth.DescriptorSystem(
     Dw=[[0, 0], [0, 1]],
     dt=1.0,
 )
+
+
+ONE_LATE = {"A": [[0.0]], "B": [[1.0]], "C": [[1.0]], "D": [[0.0]]}
 
 
 def scrambled(seed: int, index: int) -> obsynth.DescriptorSystem:
@@ -92,14 +99,42 @@ def test_gain_and_least_gain_meet_whatever_the_index(index: int, seed: int) -> N
 @pytest.mark.parametrize(
     ("index", "norm"), [(2, "hinf"), pytest.param(3, "hinf", marks=pytest.mark.long), (2, "h2"), (3, "h2")]
 )
-def test_matching_whose_best_filter_reads_later_inputs_is_that_of_outputs_read_late(index: int, norm: str) -> None:
-    one_late = {"A": [[0.0]], "B": [[1.0]], "C": [[1.0]], "D": [[0.0]]}
-    design = obsynth.optimal_filter(scrambled(0, index), reference=one_late, exact=False, norm=norm)
+def test_matching_whose_best_filter_reads_later_inputs_reads_outputs_at_once(index: int, norm: str) -> None:
+    plant = scrambled(2, index)
+    design = obsynth.optimal_filter(plant, reference=ONE_LATE, exact=False, norm=norm)
     assert design.report.passed
-    assert f"reads each output {index - 1} sample" in design.notes[-1]
-    claims = design.certificate.claims
-    own, least = (claims[name] for name in (("gain", "least") if norm == "hinf" else ("deviation", "least_deviation")))
-    assert 0.0 < least <= own <= 1.0 + 1e-6  # that of no filter
+    assert f"a state only {counted(index - 1, 'sample')} later" in design.notes[-1]
+    assert 0.0 < design.least <= design.gain < design.least * (1.0 + 1e-6)
+    gains, squares = [], []
+    for angle in (np.arange(2000) + 0.5) * np.pi / 2000:
+        point, o = np.exp(1j * angle), design.observer
+        read = o.Cz @ np.linalg.solve(point * np.eye(o.order) - o.Az, o.By.astype(complex)) + o.Dy
+        driven = np.linalg.solve(point * plant.E - plant.A, np.hstack([plant.Bf, plant.Bw]).astype(complex))
+        error = read @ (plant.C @ driven + np.hstack([plant.Df, plant.Dw])) - np.eye(1, 3) / point
+        gains.append(np.linalg.norm(error, 2))
+        squares.append(np.linalg.norm(error) ** 2)
+    reached = max(gains) if norm == "hinf" else np.sqrt(np.mean(squares))
+    assert reached == pytest.approx(design.gain, rel=1e-4)
+    assert reached <= design.gain * (1.0 + (1e-9 if norm == "hinf" else 1e-3))
+
+
+def test_matching_reads_outputs_late_where_known_inputs_would_be_needed_before_they_act() -> None:
+    plant = scrambled(1, 2)
+    known = plant.replace(B=np.ones((plant.nx, 1)), D=np.zeros((plant.ny, 1)), input_names=["u"])
+    design = obsynth.optimal_filter(known, reference=ONE_LATE, exact=False)
+    assert design.report.passed
+    assert "reads each output 1 sample late" in design.notes[-1]
+    assert 0.0 < design.least < design.gain <= 1.0 + 1e-6  # that of no filter
+
+
+@pytest.mark.parametrize("later", [None, 0.0, 2.0, 0.5, np.nan])
+def test_another_number_of_samples_by_which_errors_are_later_is_refused(later: float | None, tmp_path: Path) -> None:
+    design = obsynth.optimal_filter(scrambled(2, 2), reference=ONE_LATE, exact=False, norm="h2")
+    assert obsynth.verify(obsynth.load(design.save(tmp_path / "a.gains.json"))).passed
+    matrices = {name: part for name, part in design.certificate.matrices.items() if name != "later"}
+    matrices |= {} if later is None else {"later": np.array([[later]])}
+    assert design.certificate.matrices["later"].tolist() == [[1.0]]
+    assert not obsynth.verify(design.replace(certificate=Certificate(matrices, design.certificate.claims))).passed
 
 
 def test_faults_that_do_nothing_are_no_rounding_of_other_inputs() -> None:

@@ -68,6 +68,12 @@ def error_model(design: ObserverDesign) -> ErrorModel:
     model = method_class(design.method).error_model(design)
     if model is None or not model.fits:
         raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
+    if model.later:
+        raise SpecError(
+            f"The outputs of the plant of design {design.name!r} show inputs of later samples, and its filter reads "
+            "them at once: its errors have no model without a delay.",
+            path="observer",
+        )
     return model
 
 

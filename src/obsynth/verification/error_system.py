@@ -102,6 +102,9 @@ class ErrorModel:
         Names of the fault model's states.
     decoupled : bool, optional
         Whether no disturbance reaches z or the outputs.
+    later : int, optional
+        Samples by which the rows of ``observer`` are later than those of the shipped one.  Where outputs show inputs
+        of later samples (index 2 or more), errors of what reads them at once are a state only then.
     """
 
     plant: DescriptorSystem
@@ -113,6 +116,7 @@ class ErrorModel:
     Cw: FloatArray | None = None
     model_names: tuple[str, ...] = ()
     decoupled: bool = False
+    later: int = 0
 
     def __post_init__(self) -> None:
         if not self.observer.order:

@@ -11,7 +11,7 @@ import scipy.linalg
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed, designed
-from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.follower import Followed, error_model_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
@@ -20,7 +20,6 @@ from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
@@ -72,8 +71,7 @@ def certified(
     claims = {"order": float(observer.order)}
     if fault_map.delay is not None:
         claims["delay"] = float(fault_map.delay)
-    model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
-    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
+    channel = ErrorChannel.of(error_model_of(plant, observer, found), fault_map)
     if norm == "h2":
         return {}, claims | _deviations(chosen, channel, plant.dt)
     if chosen.is_nothing:

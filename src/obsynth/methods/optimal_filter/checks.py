@@ -17,6 +17,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     least_deviation_of_every_start,
     response_at,
 )
+from obsynth.methods.optimal_filter.follower import behind_delay
 from obsynth.methods.optimal_filter.realisation import with_modes
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
@@ -63,7 +64,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     lag = matrices["T0"].shape[1] // plant.nx - 1
     # Modes of the plant that the errors hold stay at zero in the observer, which ships without them.
     whole = with_modes(observer, matrices)
-    model = ErrorModel(plant, whole, matrices["T"], -matrices["T0"], lag=lag, decoupled=True)
+    later = _later(design)
+    whole = behind_delay(whole, later)
+    model = ErrorModel(plant, whole, matrices["T"], -matrices["T0"], lag=lag, decoupled=True, later=later)
     yield _decoupling(model, printed_digits)
     yield listed_gains(design, {name: matrices[name] for name in ("T", "T0")})
     yield stability_row(whole.Az, matrices["stability"], plant.dt, "Lyapunov")
@@ -80,7 +83,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield _fault_map(design, model)
         yield from _zeros(design, plant)
     weights = _claimed_map(design).weights
-    channel = ErrorChannel(model, None if options["exact"] else stored_reference(matrices), weights)
+    channel = ErrorChannel.of(model, _claimed_map(design))
     if options["norm"] == "h2":
         yield _deviation(channel, claimed(claims, "deviation"), plant)
         yield _least_deviation(design, plant)
@@ -123,6 +126,12 @@ def _decoupling(model: ErrorModel, printed_digits: int | None) -> Check:
     )
 
 
+def _later(design: ObserverDesign) -> int:
+    """Return by how many samples the rows are later of which T and T0 are."""
+    matrices = design.certificate.matrices
+    return int(matrices["later"][0, 0]) if "later" in matrices else 0
+
+
 def _fits(design: ObserverDesign) -> bool:
     (plant, observer), matrices = design.linear, design.certificate.matrices
     claims, options = design.certificate.claims, design.options
@@ -130,7 +139,10 @@ def _fits(design: ObserverDesign) -> bool:
         return False
     parts = (observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy, *matrices.values())
     states, reference = matrices["T0"].shape[1], stored_reference(matrices)
-    extra = 0 if reference is None or options["exact"] else len(reference[0])
+    if "later" in matrices and not (plant.is_discrete and _is_count(matrices["later"], plant.nx)):
+        return False
+    later = _later(design)
+    extra = 0 if reference is None or options["exact"] else len(reference[0]) + later * plant.nf
     try:
         weights = _claimed_map(design).weights
     except SpecError:
@@ -138,7 +150,7 @@ def _fits(design: ObserverDesign) -> bool:
     extra += 0 if weights is None else weights.order
     rows = plant.nf if reference is None else len(reference[2])
     held = matrices["modes_A"].shape[-1] if "modes_A" in matrices else 0
-    order = observer.order + held
+    order = observer.order + held + later * rows
     shapes = {
         "stability": (order,) * 2,
         "T": (order, states),
@@ -194,6 +206,11 @@ def _options_fit(design: ObserverDesign) -> bool:
         and _within_limit(observer.order, options.get("order_limit"))
         and set(options["decoupled"]) <= set(plant.disturbance_names)
     )
+
+
+def _is_count(matrix: FloatArray, most: int) -> bool:
+    """Return whether a matrix is one whole number from 1."""
+    return matrix.shape == (1, 1) and float(matrix[0, 0]) in range(1, most + 1)
 
 
 def _within_limit(order: int, limit: Any) -> bool:
@@ -287,7 +304,7 @@ def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int
     """
     plant, observer = model.plant, model.observer
     c, df, _, _ = model.output(slice(0, len(observer.Cz)))
-    points = fault_map.at_points(plant, observer.Az)
+    points = fault_map.behind_delay(model.later).at_points(plant, observer.Az)
     units = PlantUnits.of(plant).faults
     worst, largest = np.zeros(len(c)), np.zeros(len(c))
     for point, wanted in points:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from obsynth.methods.optimal_filter.fault_maps import FaultMap
 from obsynth.methods.optimal_filter.weights import Weights
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
@@ -38,6 +39,12 @@ class ErrorChannel:
     matched: Model | None = None
     weights: Weights | None = None
     unit: float = 1.0
+
+    @classmethod
+    def of(cls, model: ErrorModel, fault_map: FaultMap) -> ErrorChannel:
+        """Return that of a fault map, whose reference model is as late as the rows of the model."""
+        matched = None if fault_map.exact else fault_map.behind_delay(model.later).reference
+        return cls(model, matched, fault_map.weights)
 
     def in_units_of(self, gain: float) -> ErrorChannel:
         """Return the same with the error in units of a power of two near ``gain``."""

@@ -21,7 +21,13 @@ from obsynth.methods.optimal_filter.lasting_modes import (
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
-from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
+from obsynth.numerics.decoupling_windows import (
+    Channels,
+    EstimationProblem,
+    Model,
+    estimation_problem,
+    with_late_inputs,
+)
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.least_estimation import (
     ADDED_NOISES,
@@ -125,6 +131,14 @@ class FaultMap(NamedTuple):
         return [
             (point, np.diag(point**-late) if reference is None else response_at(reference, point)) for point in points
         ]
+
+    def behind_delay(self, samples: int) -> FaultMap:
+        """Return the map of estimates that come so many samples later."""
+        if not samples:
+            return self
+        late = self.delays and tuple(delay + samples for delay in self.delays)
+        reference = self.reference and with_late_inputs(self.reference, samples)
+        return self._replace(delays=late, reference=reference)
 
     def later(self, samples: int = 1, *, which: tuple[bool, ...] | None = None) -> FaultMap:
         """Return the map with more samples of delay, of all faults or of some."""

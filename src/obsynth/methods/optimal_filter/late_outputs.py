@@ -1,4 +1,4 @@
-"""Delayed outputs: a sampled plant with late outputs, and whether a filter needs inputs of later samples."""
+"""Delayed outputs: a sampled plant with late outputs, and how much later the inputs are that a filter shows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from obsynth.plants.plant_units import PlantUnits
 LATER_SHARE = 1e-6
 
 
-def shows_later_inputs(plant: DescriptorSystem, filter_: Model) -> bool:
-    """Whether a filter's estimates depend on inputs to the plant's equations of later samples.
+def later_inputs(plant: DescriptorSystem, filter_: Model) -> int:
+    """Return by how many samples inputs to the plant's equations are later than the estimates of a filter they reach.
 
     ``E x+ = A x + g``: outputs of index 2 or more depend on g of later samples, with coefficients that a filter may
     cancel, or not.
@@ -31,7 +31,8 @@ def shows_later_inputs(plant: DescriptorSystem, filter_: Model) -> bool:
     sizes = [
         sum(float(np.linalg.norm(part)) for part in first_responses(model, form.shift)) for model in (own, form[:4])
     ]
-    return any(float(np.linalg.norm(part)) > LATER_SHARE * sizes[0] * sizes[1] for part in shown)
+    reached = [float(np.linalg.norm(part)) > LATER_SHARE * sizes[0] * sizes[1] for part in shown]
+    return form.shift - reached.index(True) if any(reached) else 0
 
 
 def with_late_outputs(plant: DescriptorSystem, samples: int) -> DescriptorSystem:

@@ -162,6 +162,7 @@ def _error_model(design: ObserverDesign) -> ErrorModel | None:
     model = method_class(design.method).error_model(design)
     if (
         model is None
+        or model.later
         or max(model.plant.nx, model.observer.order) > MOST_STATES
         or model.observer.fault_names != model.plant.fault_names
     ):

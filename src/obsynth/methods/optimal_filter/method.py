@@ -136,7 +136,7 @@ class OptimalFilterMethod(Method):
         "order": ClaimMeaning("", "states of the filter", "order"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
-        {"T", "T0", "stability", "modes_A", "modes_C", "P", "invisible", "samples", "limit_point", "dependent"}
+        {"T", "T0", "stability", "modes_A", "modes_C", "P", "invisible", "samples", "limit_point", "dependent", "later"}
         | {f"reference_{name}" for name in "ABCD"}
     )
     # Its estimates are of the faults, but which noise counts is the caller's choice: only who names it gets it.
@@ -194,11 +194,14 @@ class OptimalFilterMethod(Method):
     def error_model(cls, design: ObserverDesign) -> ErrorModel:
         """Return the plant as it is: without faults and noise every row is zero, as T and T0 prove.
 
-        Modes of the plant that the errors hold are states of the observer here, which nothing drives."""
+        Modes of the plant that the errors hold are states of the observer here, which nothing drives.  Of outputs that
+        show inputs of later samples it is the observer behind a delay."""
+        from obsynth.methods.optimal_filter.follower import behind_delay
         from obsynth.methods.optimal_filter.realisation import with_modes
 
         (plant, observer), matrices = design.linear, design.certificate.matrices
-        observer = with_modes(observer, matrices)
+        later = int(matrices["later"][0, 0]) if "later" in matrices else 0
+        observer = behind_delay(with_modes(observer, matrices), later)
         return ErrorModel(
             plant,
             observer,
@@ -206,6 +209,7 @@ class OptimalFilterMethod(Method):
             -matrices["T0"],
             lag=matrices["T0"].shape[1] // plant.nx - 1,
             decoupled=set(design.options["decoupled"]) == set(plant.disturbance_names),
+            later=later,
         )
 
     @classmethod

@@ -150,6 +150,33 @@ def followed(
     return with_common_numbers(plant, follower) or follower
 
 
+def followed_later(plant: DescriptorSystem, filters: Sequence[Model], longest: int, later: int) -> Followed:
+    """Return a realisation, behind ``later`` samples of delay, of a filter that shows inputs so many samples later.
+
+    Its errors are a state only there; known inputs must not be among those that it needs before they have acted.
+    """
+    delayed = []
+    for a, b, c, d in filters:
+        for _ in range(later):
+            rows, order = c.shape
+            a = np.block([[a, np.zeros((order, rows))], [c, np.zeros((rows, rows))]])
+            b, c, d = np.vstack([b, d]), np.hstack([np.zeros((rows, order)), np.eye(rows)]), np.zeros_like(d)
+        delayed.append((a, b, c, d))
+    found = followed(plant, delayed, longest, finished=lambda follower: follower)
+    # The copies of modes come last: the delay does behind them.
+    whole = next(len(a) for a, *_ in delayed if np.array_equal(a, found.A[: len(a), : len(a)]))
+    own = whole - later * len(found.C)
+    order = np.r_[:own, whole : len(found.A), own:whole]
+    return found._replace(
+        A=found.A[np.ix_(order, order)],
+        B=found.B[order],
+        C=found.C[:, order],
+        T=found.T[order],
+        undriven=0,
+        later=later,
+    )
+
+
 def _first_followed(
     plant: DescriptorSystem, filters: Sequence[Model], longest: int, finished: Callable[[Followed], Followed]
 ) -> Followed:

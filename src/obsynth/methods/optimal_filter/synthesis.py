@@ -29,16 +29,22 @@ from obsynth.methods.optimal_filter.fault_maps import (
     unit_of_gains,
     without_filter,
 )
-from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.follower import Followed, before_delay, behind_delay, error_model_of
 from obsynth.methods.optimal_filter.lasting_modes import (
     ADDED_DRIVES,
     with_growing_modes_reached,
     with_lasting_modes_driven,
 )
-from obsynth.methods.optimal_filter.late_outputs import shows_later_inputs, with_late_outputs
+from obsynth.methods.optimal_filter.late_outputs import later_inputs, with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
-from obsynth.methods.optimal_filter.realisation import followed, observer_of, realisations, without_undriven
+from obsynth.methods.optimal_filter.realisation import (
+    followed,
+    followed_later,
+    observer_of,
+    realisations,
+    without_undriven,
+)
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order, free_filters
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.optimal_filter.weights import plain_weights
@@ -55,7 +61,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
-from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
+from obsynth.verification.error_system import IDENTITY_SHARE
 from obsynth.verification.inequalities import stability_factor
 from obsynth.verification.seen_outputs import seen_plant
 from obsynth.verification.signals_from_rest import has_index_one
@@ -87,6 +93,10 @@ LATE_NOTE = (
     "Outputs of this plant show inputs of later samples (its index is 2 or more): this filter reads each output "
     "{} late. The least gain is that of all causal filters, also of those that read each output at once: a gap between "
     "both is from that."
+)
+AT_ONCE_NOTE = (
+    "Outputs of this plant show inputs of later samples (its index is 2 or more), and this filter reads each output at "
+    "once: its errors are a state only {} later, of which the proofs are."
 )
 #: A filter forgets modes that last as fast as its deviation is at most this much above the least one.
 FORGETTING_ROOM = 1.01
@@ -254,7 +264,9 @@ def _made(
         chosen = chosen._replace(gain=_recomputed_gain(plant, chosen, follower, observer, method.norm))
     chosen = chosen if least is None else chosen._replace(least=min(least, chosen.gain))
     matrices, claims = certified(plant, chosen, observer, follower, method.norm)
-    matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(observer)}
+    whole = behind_delay(observer, follower.later)
+    matrices |= {"T": follower.T, "T0": follower.T0, "stability": stability_factor(whole)}
+    matrices |= {"later": np.array([[float(follower.later)]])} if follower.later else {}
     observer, modes = without_undriven(observer, follower)
     matrices, claims = matrices | modes, claims | {"order": float(observer.order)}
     reference = fault_map.reference
@@ -285,6 +297,7 @@ def _made(
         else (_reduced_note(chosen, observer.order, full, claims),)
     )
     notes += (MODES_NOTE,) if modes else ()
+    notes += (AT_ONCE_NOTE.format(counted(follower.later, "sample")),) if follower.later else ()
     notes += () if searched is None else (LASTING_NOTE,)
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
 
@@ -293,9 +306,7 @@ def _recomputed_gain(
     plant: DescriptorSystem, chosen: Designed, follower: Followed, observer: LinearObserver, norm: str
 ) -> float:
     """Return the norm of a filter on a plant, which need not be the one that it was searched for."""
-    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
-    fault_map = chosen.fault_map
-    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
+    channel = ErrorChannel.of(error_model_of(plant, observer, follower), chosen.fault_map)
     if norm == "h2":
         return channel.deviation(plant.dt)
     a, b, c, d = channel.middle
@@ -413,11 +424,7 @@ def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: Followed, o
 def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Followed, LinearObserver, float]:
     """Return a filter's realisation, and by which share it misses its fault map."""
     problem, fault_map = chosen.problem, chosen.fault_map
-    if problem.shift and shows_later_inputs(plant, chosen.filter):
-        raise SolverError(
-            "The filter of least gain reads outputs that show inputs of later samples, of which its errors are no "
-            "state: the result is inconclusive. Give a longer delay."
-        )
+    later = later_inputs(plant, chosen.filter) if problem.shift else 0
     outputs = PlantUnits.of(plant).rounded().outputs
     ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
     # One of few states may follow the plant by states that y does not reach.
@@ -426,7 +433,10 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
     if white:
         ways = without_white_noise(plant, fault_map, ways)
     finished = partial(with_digits_of, plant, fault_map) if white else _unchanged
-    follower = followed(plant, ways, problem.window + problem.shift, finished=finished)
+    longest = problem.window + problem.shift
+    follower = (
+        followed_later(plant, ways, longest, later) if later else followed(plant, ways, longest, finished=finished)
+    )
     observer, missed_identities, missed = _followed_by(plant, fault_map, follower)
     if not missed_identities <= IDENTITY_SHARE:
         raise SolverError(
@@ -435,7 +445,7 @@ def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Fol
             "reference model of a hundredth of the bandwidth: either gave a filter where this was seen."
         )
     if missed > EXACT_SHARE:
-        exact = with_fault_map(plant, fault_map, follower)
+        exact = with_fault_map(plant, fault_map.behind_delay(later), follower)
         own, missed_identities, less = _followed_by(plant, fault_map, exact)
         if missed_identities <= IDENTITY_SHARE and less < missed:
             return exact, own, less
@@ -449,7 +459,8 @@ def _followed_by(
     rows = len(follower.C)
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
-    model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
+    observer = before_delay(observer, follower.later)
+    model = error_model_of(plant, observer, follower)
     return observer, model.missed(), fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
 
 
