@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 from obsynth.numerics.central_equation import CentralEquation, Whitened, central_injection
-from obsynth.numerics.central_filter import central_filter_at, search_central_filter
+from obsynth.numerics.central_filter import NOISE_WEIGHTS, central_filter_at, placed_filters, search_central_filter
 from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
 from obsynth.numerics.gain_levels import compared_gain
 from obsynth.numerics.injection_problem import GainProblem, Injection
@@ -68,6 +68,23 @@ def test_doubling_in_continuous_time_gives_nothing_that_is_stable_for_what_is_no
 def test_doubling_says_so_when_there_is_no_solution():
     # x grows and nothing is measured of it.
     assert doubled_riccati_solution(2.0 * np.eye(1), np.zeros((1, 1)), np.eye(1), np.eye(1), np.zeros((1, 1))) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_heaviest_noise_is_the_same_wherever_its_search_begins(seed):
+    problem = random_problem(np.random.default_rng([52, seed]))
+    level = 2.0 * search_central_filter(problem, central_injection(problem, 1e6, noise=1e-1))[1]
+
+    def found(near):
+        return [*placed_filters(problem, level, reaches=lambda item: problem.achieved_gain(item) <= level, near=near)]
+
+    usual = found(None)
+    assert usual
+    assert 0 < usual[0][0] < len(NOISE_WEIGHTS) - 1
+    for near in (0, usual[0][0], len(NOISE_WEIGHTS) - 1):
+        for (place, injection), (other_place, other) in zip(found(near), usual, strict=True):
+            assert place == other_place
+            np.testing.assert_array_equal(injection.R, other.R)
 
 
 @pytest.mark.parametrize("free_weight", [False, True])

@@ -231,12 +231,26 @@ def noise_weighted_filters(
 
     The noise, times a weight, is one more disturbance; at a level above ``gain`` the true gain finds the weight.
     """
+    for _, injection in placed_filters(problem, gain, reaches=reaches, artificial=artificial):
+        yield injection
+
+
+def placed_filters(
+    problem: GainProblem,
+    gain: float,
+    *,
+    reaches: Callable[[Injection], bool],
+    artificial: float = NOISES[0],
+    near: int | None = None,
+) -> Iterator[tuple[int, Injection]]:
+    """Yield `noise_weighted_filters` with their places among the weights; the search begins ``near`` one of these."""
     work = with_least_weight(problem)
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
     coarse = 1 if work.order <= HIGHER_LEVEL_UP_TO else COARSE_WEIGHTS
-    weights, begin, last = (NOISE_WEIGHTS * sizes[0] / sizes[1])[::coarse], USUAL_WEIGHT // coarse, 0
+    weights, last = (NOISE_WEIGHTS * sizes[0] / sizes[1])[::coarse], 0
+    begin = USUAL_WEIGHT // coarse if near is None else near
 
     def tried(place: int, factor: float) -> Injection | None:
         injection = central_injection(_with_noise(work, weights[place]), factor * gain, noise=artificial)
@@ -248,7 +262,7 @@ def noise_weighted_filters(
         heaviest = last_found(partial(tried, factor=factor), places, begin)
         if heaviest is not None:
             begin = last = heaviest[0]
-            yield heaviest[1]
+            yield heaviest
 
 
 def last_found(tried: Callable[[int], Found | None], places: range, begin: int) -> tuple[int, Found] | None:

@@ -25,6 +25,7 @@ from obsynth.numerics.central_filter import (
     least_noise_filter,
     noise_weighted_filters,
     noise_weighted_filters_within,
+    placed_filters,
 )
 from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit
 from obsynth.numerics.regions import disk
@@ -250,11 +251,13 @@ def _fast_filters(goal: Goal) -> list[Injection]:
     problem = goal.problem
     size = largest_singular_value(np.vstack([problem.Bn, problem.Dn]))
     filters: list[Injection] = []
+    near: int | None = None
     for share in STATE_NOISE:
         noisier = problem.with_state_noise(share * size)
-        filters += [
-            item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)
-        ]
+        placed = [*placed_filters(noisier, goal.gain, reaches=goal.met, near=near)]
+        filters += [item for _, item in placed if goal.met_fast(item)]
+        # Among many states each weight is an equation: the next share's are found near those of this one.
+        near = placed[0][0] if placed and problem.order > FEW_STATES else None
     least = min(map(goal.cost, filters), default=0.0)
     return sorted((item for item in filters if goal.cost(item) <= PRICE_OF_SPEED * least), key=problem.radius)
 
