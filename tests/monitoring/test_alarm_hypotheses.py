@@ -250,6 +250,21 @@ def test_an_unexplained_alarm_is_shelved_until_a_fault_explains_it():
     assert (event.fault, math.isnan(event.shelved)) == ("leak", True)
 
 
+def test_an_alarm_that_goes_on_under_another_name_says_so():
+    """A long alarm was listed as two of different faults: that the first one still stands was nowhere said."""
+    events, first, later = AlarmLog(["time"]), ranking(90.0, 5.0, 3.0), ranking(5.0, 3.0, 90.0)
+    for row in range(1, 91):
+        events.advance(0 if row != 61 else 30)
+        named = first if row <= 20 else later._replace(earlier=1, ratio=90.0)
+        named = named if row <= 40 else first._replace(earlier=2, ratio=90.0)
+        events.take("learned", named.named, 2.0, 10.0 * row, row, [0.0], ranking=named)
+    assert [event.fault for event in events.events()] == ["leak", "sensor y", "leak", "leak"]
+    table = alarm_rows(events.events(), str)[0]
+    names = [row[table[0].index("fault")] for row in table[1:]]
+    assert names == ["leak", "sensor y; the alarm of leak still stands", "leak; the alarm of leak still stands", "leak"]
+    assert [event.as_dict()["while_standing"] for event in events.events()] == ["", "leak", "leak", ""]
+
+
 def test_slow_changes_that_estimates_follow_are_ranked_by_their_own_likelihoods():
     """Residuals of half a leak return to zero while the estimate follows it: the alarm had no name and no list."""
     faults, passed = ("leak", "pump", "worn"), np.array([True, True, False])

@@ -189,17 +189,38 @@ def test_correlations_are_sought_between_a_third_of_a_sample_and_the_length_of_t
 @pytest.mark.parametrize(("nats", "taken"), [(8.5, False), (9.5, True)])
 def test_a_state_for_coloured_noise_pays_for_two_numbers(monkeypatch, nats: float, taken: bool) -> None:
     """Log(400) = 5.99 for both numbers together, and three nats that no explanation is below."""
-    known = SimpleNamespace(best=lambda problem: (100.0 - nats, known))
+    found, told, _ = states_of_colour(monkeypatch, nats, needed=7)
+    assert bool(found) == taken == bool(told)
+
+
+@pytest.mark.parametrize(
+    ("nats", "needed", "told"), [(8.5, 5, True), (8.5, 6, False), (5.5, 5, False), (9.5, 5, False)]
+)
+def test_coloured_noise_that_process_noise_stands_for_is_told(
+    monkeypatch, nats: float, needed: int, told: bool
+) -> None:
+    """A level that a sensor with coloured noise shows was followed by process noise, and a jump of that sensor was a
+    fault of the plant; the colour saves the process noise, and adds no number."""
+    *_, remarks = states_of_colour(monkeypatch, nats, needed=needed)
+    assert bool(remarks) == told
+    assert all("over about 14 s" in text and "{y: {correlation: unknown}}" in text for text in remarks)
+
+
+def states_of_colour(monkeypatch, nats: float, *, needed: int) -> tuple:
+    """Return the states, and what is told, where coloured noise of one sensor is better by so many nats and the log
+    needs so many numbers beside it, five without it."""
+    known = SimpleNamespace(t={"correlation of y": math.log(14.0)})
+    known.best = lambda problem: (100.0 - nats, known, lambda: needed)
+    monkeypatch.setattr(calibrating, "_needed_by_fit", lambda problem, fit: 5)
     monkeypatch.setattr(calibrating, "_proposals", lambda problem, fit: {("coloured", "y")})
     monkeypatch.setattr(calibrating, "like_problem", lambda problem, new: new)
     monkeypatch.setattr(calibrating, "_SearchStart", SimpleNamespace(of=lambda problem, fit: known))
     problem = SimpleNamespace(
         output_names=("y",), plant=SimpleNamespace(unknown_inputs=()), log=SimpleNamespace(samples=400)
     )
-    found, told = calibrating.proposed_states(
+    return calibrating.proposed_states(
         problem, SimpleNamespace(value=100.0), NoiseStates(), ("coloured",), lambda states: problem, lambda text: None
     )
-    assert bool(found) == taken == bool(told)
 
 
 FILE = {

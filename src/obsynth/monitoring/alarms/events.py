@@ -45,6 +45,9 @@ SHELVED_AFTER = max(AGES)
 #: What is said of one.
 SHELVED = "shelved: unexplained offset since {}"
 
+#: What is said of an alarm that goes on under another name.
+STILL = "the alarm of {} still stands"
+
 #: Shares of hypotheses below this are not listed.
 LEAST_SHARE = 0.01
 
@@ -108,6 +111,9 @@ class AlarmEvent:
         Since when there has been an offset that no fault explains, where it has stood for 200 rows; else NaN.
     beyond : tuple of str
         Known inputs that were beyond the range that thresholds were learned from, in it or within 200 rows before.
+    while_standing : str
+        What the alarm was called at first, where this one is its continuation under another name: it goes on without
+        a pause, and what came later is named since then.  Else empty.
 
     Examples
     --------
@@ -139,6 +145,7 @@ class AlarmEvent:
     drifts: bool = False
     shelved: float = math.nan
     beyond: tuple[str, ...] = ()
+    while_standing: str = ""
 
     @property
     def clear(self) -> bool:
@@ -198,7 +205,10 @@ class AlarmLog:
         before = self._open.get(by)
         earlier = 0 if ranking is None else ranking.earlier
         is_another = before is not None and earlier > self._earlier[by]
+        while_standing = "" if before is None else before.while_standing
         if before is not None and (is_another or self._place - self._places_of[by] > HOLD):
+            stood = self._place - self._places_of[by] <= HOLD
+            while_standing = (before.while_standing or before.fault or NOT_DISTINGUISHED_YET) if stood else ""
             self._closed.append(self._open.pop(by))
             before = None
         if before is None:
@@ -236,6 +246,7 @@ class AlarmLog:
             distinguished=distinguished or (before is not None and before.distinguished),
             shelved=shelved,
             beyond=tuple(dict.fromkeys((*(() if before is None else before.beyond), *beyond))),
+            while_standing=while_standing,
             **self._ranked(before, ranking, tells=tells),
         )
 
@@ -302,8 +313,14 @@ def alarm_rows(
 
 
 def fault_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
-    """Return what an alarm is said to be: with all that is as likely, whether it drifts, and since when it is
-    shelved."""
+    """Return what an alarm is said to be: with all that is as likely, whether it drifts, since when it is shelved, and
+    whether it is the alarm before under another name."""
+    text = _named_text(event, date_of)
+    return f"{text}; {STILL.format(event.while_standing)}" if text and event.while_standing else text
+
+
+def _named_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
+    """Return what an alarm is said to be by itself."""
     if not math.isnan(event.shelved):
         return f"{event.fault} ({SHELVED.format(date_of(event.shelved))})"
     if not event.distinguished:

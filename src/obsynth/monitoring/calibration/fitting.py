@@ -153,14 +153,14 @@ class Fitting:
         """Return the fit with states of some kinds where its innovations ask for them; ``before``: the notes on
         those that it has."""
         log = fitted.problem.log
-        states, sentences = proposed_states(
+        states, sentences, remarks = proposed_states(
             fitted.problem, fit, stated, kinds, lambda states: self.problem_with(states, log), self.note
         )
         if not sentences:
-            return fitted
+            return replace(fitted, problem=fitted.problem.with_notes(*remarks)) if remarks else fitted
         again = self.fitted(self.problem_with(states, log), search=False)
         # What is white beside coloured noise is less than both: more samples stand out.
-        problem = again.problem.with_notes(*before, *sentences)
+        problem = again.problem.with_notes(*before, *sentences, *remarks)
         return self.without_outliers(replace(again, problem=problem, losses=fitted.losses))
 
     def on_all_rows(self, fitted: FittedProblem, fit: InnovationsFit, log: RecordedLog) -> FittedProblem:

@@ -19,7 +19,7 @@ from obsynth.monitoring.calibration.diagnostics import SIGNIFICANT, mean_off, wh
 from obsynth.monitoring.calibration.explanations import LEAST_EXPLANATION, regression_gain
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
-from obsynth.monitoring.calibration.maximum import Objective
+from obsynth.monitoring.calibration.maximum import COLLAPSE, COLLAPSE_NATS, Objective
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem
@@ -34,6 +34,11 @@ ADDED_NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
 
 #: Nats above which a state is taken.  An offset that is not taken spoils constants, and one too many only widens boxes.
 LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLANATION}
+
+#: Nats by which coloured noise has to be better to be reported where the process noise that stands for it is no longer
+#: needed beside it, so that it adds no number: what stays near its mean fits a log that wanders at random by so much
+#: better in one of a hundred (Dickey & Fuller 1979, with a mean: half of the square of 3.43).
+LEAST_REPLACEMENT = 5.9
 
 #: Nats that an offset explains beside constants, variances as they are, before it is tried; and by how much constants
 #: are moved to see what they explain, in widths of their bounds.
@@ -54,6 +59,13 @@ _STATE_SENTENCES = {
     "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
 }
 
+_REPLACED = (
+    "Process noise may stand for coloured noise of {name} here: with noise of {name} that is correlated over about "
+    "{time:.2g} s, the log needs it no longer, and is better by {gain:.3g} nats. As it is, a design follows {name}, "
+    "and its monitor may not see a fault of that sensor. If the noise is coloured, state this (sensor_noise: "
+    "{{{name}: {{correlation: unknown}}}} in calibrate)."
+)
+
 _OFFSET_HIDES = (
     "At constant inputs {faults} cannot be distinguished from the offset of {name}: a design for both may be "
     "refused. If the sensor has no offset, state this (offset: {{}} in calibrate)."
@@ -73,26 +85,30 @@ def proposed_states(
     kinds: Sequence[str],
     problem_with: Callable[[NoiseStates], CalibrationProblem],
     note: Callable[[str], object],
-) -> tuple[NoiseStates, list[str]]:
-    """Return the states asked for with those that the innovations ask for, and a sentence for each of these."""
+) -> tuple[NoiseStates, list[str], list[str]]:
+    """Return the states asked for with those that the innovations ask for, and a sentence for each of these; and one
+    for coloured noise that is not taken, but for which process noise may stand."""
     states, sentences = stated, list[str]()
     asking = _proposals(problem, fit)
     value, start = fit.value, _SearchStart.of(problem, fit)
+    needed_before: Callable[[], int] = lambda: _needed_by_fit(problem, fit)  # noqa: E731 - counted where asked
     while True:
-        candidates = []
+        candidates, replacements = [], {}
         for kind, name, tried in _candidates(states, kinds, problem.output_names, problem.plant.unknown_inputs):
             if (kind, name) not in asking:
                 continue
             note(f"{kind} of {name}")
-            reached, place = start.best(like_problem(problem, problem_with(tried)))
+            reached, place, needed = start.best(like_problem(problem, problem_with(tried)))
             gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
             least = LEAST_NATS[kind]
             if kind == "offset" and least < gain < LEAST_EXPLANATION and hidden_faults(problem, fit, tried):
                 least = LEAST_EXPLANATION
-            candidates.append((gain - least, kind, name, tried, reached, place))
+            candidates.append((gain - least, kind, name, tried, reached, place, needed))
+            if kind == "coloured" and value - reached > LEAST_REPLACEMENT:
+                replacements[name] = value - reached, place.t[correlation_name(name)], needed()
         if not candidates:
             break
-        gain, kind, name, tried, reached, place = max(candidates, key=lambda item: item[0])
+        gain, kind, name, tried, reached, place, needed = max(candidates, key=lambda item: item[0])
         if not gain > 0.0:
             break
         hidden = hidden_faults(problem, fit, tried) if kind == "offset" else ()
@@ -102,8 +118,40 @@ def proposed_states(
             sentences.append(_MODEL_ERROR.format(name=name))
         if hidden:
             sentences.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
-        states, value, start = tried, reached, place
-    return states, sentences
+        states, value, start, needed_before = tried, reached, place, needed
+    remarks = [
+        _REPLACED.format(name=name, time=np.exp(time), gain=gain)
+        for name, (gain, time, numbers) in replacements.items()
+        if numbers <= needed_before()
+    ]
+    return states, sentences, remarks
+
+
+def _needed_by_fit(problem: CalibrationProblem, fit: InnovationsFit) -> int:
+    """Return how many numbers the log needs where it was fitted."""
+    deviations = np.sqrt(np.nanmean(fit.innovations**2, axis=0))
+    objective = Objective(problem, Fit(fit.t, problem.x0, deviations, 0.0, np.zeros((0, 0))))
+    return needed_numbers(objective, objective.free_of(fit.v))
+
+
+def needed_numbers(objective: Objective, z: FloatArray) -> int:
+    """Return how many of the free variables the log needs at a maximum ``z``: constants, correlations, and variances
+    that it distinguishes from zero, one after the other."""
+    value, held, unneeded = objective(z)[0], z.copy(), 0
+    places = [int(i) for i in np.flatnonzero(objective.is_q | objective.is_r)]
+    for i in sorted(places, key=lambda i: objective(_collapsed_at(objective, z, i))[0]):
+        trial = _collapsed_at(objective, held, i)
+        reached = objective(trial)[0]
+        if reached - value < COLLAPSE_NATS:
+            held, value, unneeded = trial, min(value, reached), unneeded + 1
+    return objective.size - unneeded
+
+
+def _collapsed_at(objective: Objective, z: FloatArray, i: int) -> FloatArray:
+    """Return free variables of which one variance is next to nothing, or the least that it may be."""
+    trial = z.copy()
+    trial[i] = max(z[i] - COLLAPSE, objective.low[i])
+    return trial
 
 
 def hidden_faults(problem: CalibrationProblem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
@@ -208,8 +256,9 @@ class _SearchStart:
         spread = np.nanmean(fit.innovations**2, axis=0)
         return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, autocorrelations, spread)
 
-    def best(self, problem: CalibrationProblem) -> tuple[float, _SearchStart]:
-        """Return the least negative log likelihood with another model, and what it found."""
+    def best(self, problem: CalibrationProblem) -> tuple[float, _SearchStart, Callable[[], int]]:
+        """Return the least negative log likelihood with another model, what it found, and what counts the numbers that
+        the log needs there."""
         plant = problem.plant
         nominal = {name: float(value) for name, value in zip(problem.unknown, problem.nominal, strict=True)}
         best, value = None, np.inf
@@ -243,13 +292,14 @@ class _SearchStart:
             if not isinstance(plant, PlantWithNoise) or not plant.bounds:
                 break
         if best is None:
-            return np.inf, self
+            return np.inf, self, lambda: 0
         objective, z = best
         Q, R = objective.noise(z)
         variances_at = dict(zip(_letters(problem), (*Q.tolist(), *R.tolist()), strict=True))
-        return value, _SearchStart(
+        place = _SearchStart(
             dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)),
             variances_at,
             self.autocorrelations,
             self.R,
         )
+        return value, place, lambda: needed_numbers(objective, z)
