@@ -120,6 +120,16 @@ def test_a_mapping_of_columns_is_the_frame(design, frame) -> None:
     assert _same(design, {**frame, "time": dates}, frame).table["time"].iloc[1] == pd.Timestamp("2026-05-01T00:00:00.5")
 
 
+def test_an_array_with_names_is_the_frame(design, frame) -> None:
+    _same(design, frame.to_records(index=False), frame)
+
+
+def test_a_date_that_is_missing_is_no_time(design, frame) -> None:
+    dates = pd.Series(pd.date_range("2026-05-01", periods=ROWS, freq="500ms"))
+    with pytest.raises(SpecError, match="Row 5 has no time"):
+        obsynth.run_on_data(design, frame.assign(time=dates.where(dates.index != 4)))
+
+
 def test_tables_of_other_libraries_are_the_frame(design, frame) -> None:
     pyarrow = pytest.importorskip("pyarrow")
     _same(design, pyarrow.Table.from_pandas(frame), frame)

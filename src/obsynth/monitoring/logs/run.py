@@ -446,9 +446,10 @@ def _run_rows(
     held, is_whole = HeldSignals(), True
     if save is None:
         for chunk in rows:
+            output_rows = run.take(chunk)  # refuses rows without a time
             if measured is not None:
                 measured.keep([chunk[:, 0].tolist(), *run.signals.measured(chunk).T], len(chunk))
-            sink(run.take(chunk))
+            sink(output_rows)
             progress(run.rows)
         sink(run.finish())
         return

@@ -41,9 +41,11 @@ def log_suffix(path: Path) -> str:
 
 def as_frame(data: Any) -> Any:
     """Return a data frame of a mapping from names to columns, or of a table of another library that can become one
-    (polars, pyarrow); what is neither as it is.  Raise `SpecError` for an array, whose columns have no names."""
+    (polars, pyarrow); what is neither as it is.  Raise `SpecError` for an array whose columns have no names."""
     import pandas as pd
 
+    if isinstance(data, np.ndarray) and data.dtype.names:
+        return pd.DataFrame.from_records(data)
     if isinstance(data, np.ndarray):
         raise SpecError(
             "data is an array, whose columns have no names: give a pandas.DataFrame, or columns by name, as "
