@@ -93,7 +93,7 @@ _PUBLIC_NAMES = {
     "results.verification_report": "VerificationReport",
     "simulation.dae": "simulate_dae",
     "simulation.linear": "simulate_time_varying",
-    "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
+    "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck TimeTable Uniform",
     "simulation.scenario": "Scenario",
     "simulation.simulate": "simulate",
     "specs.loader": "Spec load_spec",

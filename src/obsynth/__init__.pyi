@@ -88,6 +88,7 @@ from obsynth.simulation.profiles import Ramp as Ramp
 from obsynth.simulation.profiles import Sine as Sine
 from obsynth.simulation.profiles import Step as Step
 from obsynth.simulation.profiles import Stuck as Stuck
+from obsynth.simulation.profiles import TimeTable as TimeTable
 from obsynth.simulation.profiles import Uniform as Uniform
 from obsynth.simulation.scenario import Scenario as Scenario
 from obsynth.simulation.simulate import simulate as simulate

@@ -9,13 +9,22 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Gt, Le
+from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import OpenUnitInterval, Positive, check_fields, is_finite_number, is_number, shown
+from obsynth.numerics.arguments import (
+    OpenUnitInterval,
+    Positive,
+    check_fields,
+    is_finite_number,
+    is_number,
+    real_array,
+    shown,
+)
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.numerics.suggestions import fields_suggested
 
@@ -29,13 +38,15 @@ class Profile:
 
     #: Whether the signal is held between samples; else it is linear there.
     held: ClassVar[bool] = True
+    #: Fields that are no single numbers; a profile checks its own.
+    no_numbers: ClassVar[tuple[str, ...]] = ()
     start: float = 0.0
     end: float = math.inf
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            if value is None and item.name == "value":
+            if item.name in self.no_numbers or (value is None and item.name == "value"):
                 continue
             if not is_finite_number(value) and not (item.name == "end" and is_number(value) and value == math.inf):
                 raise SpecError(f"{item.name} is {shown(value)}: give a finite number.", path=item.name)
@@ -58,11 +69,15 @@ class Additive(Profile, ABC):
     def _at(self, time: FloatArray) -> FloatArray:
         """Return its values at ``time``, seconds."""
 
+    def _is_held(self) -> bool:
+        """Whether this one is held between samples."""
+        return self.held
+
     def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
         acts, values = self.active(steps, dt), self._at(dt * np.arange(steps + 1, dtype=np.float64))
         at_begin = np.where(acts, values[:-1], 0.0)
-        return at_begin, at_begin.copy() if self.held else np.where(acts, values[1:], 0.0)
+        return at_begin, at_begin.copy() if self._is_held() else np.where(acts, values[1:], 0.0)
 
 
 @fields_suggested
@@ -238,6 +253,69 @@ class Intermittent(Additive):
     def _at(self, time: FloatArray) -> FloatArray:
         turn = (time - self.start) / self.period + SAMPLE_SLACK
         return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
+
+
+@fields_suggested
+@dataclass(frozen=True, kw_only=True)
+class TimeTable(Additive):
+    """A course through given points, such as a recorded input or a drive cycle.
+
+    Parameters
+    ----------
+    times : array_like, seconds
+        ``(n,)``, of the scenario's time, increasing.
+    values : array_like
+        ``(n,)``, in the signal's unit; the first one before the first time, the last one after the last.
+    interpolation : {"linear", "held"}, optional
+        Straight lines between the points, or each value until the next time; between samples it is linear or held.
+    start, end : float, optional, seconds
+        When it acts; zero outside.
+
+    Raises
+    ------
+    SpecError
+        The lists are empty, differ in length or hold something that is no finite number, the times do not increase, or
+        ``end`` is not after ``start``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> left, right = obsynth.TimeTable(times=[0.0, 2.0, 3.0], values=[0.0, 1.0, -1.0]).sampled(5, 1.0)
+    >>> left, right
+    (array([ 0. ,  0.5,  1. , -1. , -1. ]), array([ 0.5,  1. , -1. , -1. , -1. ]))
+    """
+
+    held: ClassVar[bool] = False
+    no_numbers: ClassVar[tuple[str, ...]] = ("times", "values", "interpolation")
+    times: ArrayLike
+    values: ArrayLike
+    interpolation: Literal["linear", "held"] = "linear"
+
+    def __post_init__(self) -> None:
+        for name in ("times", "values"):
+            points = real_array(getattr(self, name), name)
+            if points.ndim != 1 or not points.size or not np.isfinite(points).all():
+                raise SpecError(f"{name} must be a list of finite numbers, one or more.", path=name)
+            require_no_overflow(points, name, name)
+            object.__setattr__(self, name, tuple(points.tolist()))
+        super().__post_init__()
+        times, values = np.asarray(self.times), np.asarray(self.values)
+        if len(times) != len(values):
+            raise SpecError(f"times has {len(times)} entries, values has {len(values)}: give as many.", path="values")
+        falls = np.flatnonzero(np.diff(times) <= 0.0)
+        if falls.size:
+            k = int(falls[0])
+            raise SpecError(f"times must increase: {times[k + 1]:g} s follows {times[k]:g} s.", path="times")
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        times, values = np.asarray(self.times, dtype=np.float64), np.asarray(self.values, dtype=np.float64)
+        if self.interpolation == "linear":
+            return np.interp(time, times, values)
+        slack = SAMPLE_SLACK * float(np.min(np.diff(times), initial=1.0))
+        return np.asarray(values[np.maximum(np.searchsorted(times, time + slack, side="right") - 1, 0)])
+
+    def _is_held(self) -> bool:
+        return self.interpolation == "held"
 
 
 @fields_suggested

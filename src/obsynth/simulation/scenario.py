@@ -29,6 +29,7 @@ from obsynth.simulation.profiles import (
     Sine,
     Step,
     Stuck,
+    TimeTable,
     Uniform,
 )
 
@@ -39,6 +40,7 @@ PROFILE_KINDS: dict[str, type[Profile]] = {
     "sine": Sine,
     "drift": Drift,
     "intermittent": Intermittent,
+    "time-table": TimeTable,
     "stuck": Stuck,
     "lost-effectiveness": LostEffectiveness,
     "uniform": Uniform,

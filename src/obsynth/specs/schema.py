@@ -5,6 +5,7 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from typing import Annotated, Any, Literal
@@ -27,12 +28,22 @@ _PROFILE_KEYS = [item.name for profile in PROFILE_KINDS.values() for item in fie
 _PROFILE_TIMES = ("start", "end", "time_constant", "period")
 _ProfileTime = Annotated[float | None, BeforeValidator(in_seconds)]
 
+#: Keys of profiles that are no single numbers.
+_PROFILE_LISTS: Mapping[str, Any] = {
+    "times": list[float] | None,
+    "values": list[float] | None,
+    "interpolation": Literal["linear", "held"] | None,
+}
+
 #: How a signal goes with time; which keys belong to which kind is checked when it is built.
 ProfileSection: Any = create_model(  # type: ignore[call-overload]
     "ProfileSection",
     __base__=Section,
     kind=(Literal[tuple(PROFILE_KINDS)], ...),
-    **{name: (_ProfileTime if name in _PROFILE_TIMES else float | None, None) for name in _PROFILE_KEYS},
+    **{
+        name: (_PROFILE_LISTS.get(name, _ProfileTime if name in _PROFILE_TIMES else float | None), None)
+        for name in _PROFILE_KEYS
+    },
 )
 
 #: The sections of a spec that are checked by themselves: those which it has not are not made.
