@@ -17,6 +17,7 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import ExtendedBall
 from obsynth.proofs.linear_equations import enclosed_solution
 from obsynth.proofs.products import as_ball
+from obsynth.verification import settled_faults
 from obsynth.verification.constant_faults import constant_fault_row
 from obsynth.verification.settled_faults import ConstantFaults
 
@@ -237,3 +238,27 @@ def test_solutions_of_all_members_are_enclosed(seed: int) -> None:
         of_right = rng.choice([-1.0, 1.0], (n, 1)) * beside * (turn % 3 != 2)
         solution = np.linalg.solve(matrix + of_matrix, right + of_right)
         assert np.all(np.abs(solution - found.midpoint) <= found.radius * (1.0 + 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("slow", "settles"), [(0.9, True), (1.0 - 1e-5, True), (1.0 - 1e-8, False), (1.0 - 1e-14, False), (1.0, False)]
+)
+def test_whether_many_states_settle_is_told_without_digits_as_it_is_with_them(
+    slow: float, settles: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(52)
+    count = settled_faults.FEW_STATES_IN_BITS + 1
+    turn = np.linalg.qr(rng.normal(size=(count, count)))[0]
+    A = turn @ np.diag([slow, *rng.uniform(-0.9, 0.9, count - 1)]) @ turn.T
+    plant = obsynth.DescriptorSystem(A=A, C=np.eye(count), Bf=rng.normal(size=(count, 1)), dt=1.0)
+    asked: list[type] = []
+    told = settled_faults._state_at
+    monkeypatch.setattr(
+        settled_faults, "_state_at", lambda plant, point, kind: (asked.append(kind), told(plant, point, kind))[1]
+    )
+    quick = settled_faults.has_steady_state(plant, None, settled_faults.SLOWEST_SETTLING)
+    needs_digits = settled_faults.ExtendedBall in asked
+    monkeypatch.setattr(settled_faults, "FEW_STATES_IN_BITS", count)
+    assert quick == settled_faults.has_steady_state(plant, None, settled_faults.SLOWEST_SETTLING) == settles
+    # Within rounding of an integrator doubles enclose no state.
+    assert needs_digits == (1.0 - slow < 1e-12)
