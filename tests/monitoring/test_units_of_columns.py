@@ -94,3 +94,56 @@ def test_conversions_are_exact_where_they_are_factors():
     assert conversion("degC", "°C") == (1.0, 0.0)
     assert conversion("north side", "degC") is None
     assert conversion("1 +", "V") is None
+
+
+@with_pint
+@pytest.mark.parametrize(
+    ("header", "factor", "told", "scale"),
+    [
+        # The header is wrong: the values are in the unit of the plant.
+        (
+            "power (kW),wall,air",
+            1.0,
+            r"power .*its header says kW, and the values are in W already.*power=1,",
+            1.0,
+        ),
+        ("power (mW),wall,air", 1.0, r"power .*its header says mW, and the values are in W already.*power=1,", 1.0),
+        # Megawatts under a header of kilowatts.
+        ("power (kW),wall,air", 1e-6, r"give the factor .*power=1000000,", 1e6),
+    ],
+)
+def test_a_factor_that_is_advised_stands_instead_of_a_header_that_is_wrong(header, factor, told, scale):
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [1e-4]], C=np.eye(2), Bf=[[1], [0]], dt=1.0,
+        input_names=["power"], output_names=["wall", "air"], units={"power": "W", "wall": "degC", "air": "degC"},
+        operating_point={"power": 5000.0, "wall": 20.0, "air": 20.0}, sensor_noise={"wall": 0.1, "air": 0.1},
+    )  # fmt: skip
+    heated = obsynth.ui_pi_observer(plant)
+    rng = np.random.default_rng(1)
+    own = np.column_stack([np.arange(30.0), 5000.0 + rng.normal(size=30), 20.0 + rng.normal(size=(30, 2))])
+    expected = obsynth.run_on_data(heated, pd.DataFrame(own, columns=["time", "power", "wall", "air"])).table
+    data = pd.DataFrame(own, columns=["time", *header.split(",")])
+    data.iloc[:, 1] = own[:, 1] * factor
+    with pytest.raises(obsynth.SpecError, match=told):
+        obsynth.run_on_data(heated, data)
+    found = obsynth.run_on_data(heated, data, scales={"power": scale})
+    np.testing.assert_allclose(found.table["fhat[f1]"], expected["fhat[f1]"], atol=1e-9)
+
+
+@with_pint
+def test_kelvin_in_a_header_above_degrees_is_told():
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.8]], C=np.eye(2), Bf=[[1], [0]], dt=1.0, output_names=["wall", "air"],
+        units={"wall": "degC", "air": "degC"}, operating_point={"wall": 20.0, "air": 20.0},
+        sensor_noise={"wall": 0.1, "air": 0.1},
+    )  # fmt: skip
+    cold = obsynth.ui_pi_observer(plant)
+    own = np.column_stack([np.arange(30.0), 20.0 + np.random.default_rng(1).normal(size=(30, 2))])
+    data = pd.DataFrame(own, columns=["time", "wall (K)", "air"])
+    with pytest.raises(
+        obsynth.SpecError, match=r"wall .*its header says K, and the values are in degC already.*wall=1"
+    ):
+        obsynth.run_on_data(cold, data)
+    expected = obsynth.run_on_data(cold, pd.DataFrame(own, columns=["time", "wall", "air"])).table
+    found = obsynth.run_on_data(cold, data, scales={"wall": 1.0}).table
+    np.testing.assert_allclose(found["fhat[f1]"], expected["fhat[f1]"], atol=1e-9)

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,14 @@ _BAD_STATUS = ("bad", "invalid", "not good")
 _TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")
 
 
+class HeaderUnit(NamedTuple):
+    """The unit that a log states of a column, and what makes values in the plant's unit of it."""
+
+    unit: str
+    factor: float
+    shift: float
+
+
 @dataclass(frozen=True, eq=False)
 class LogSignals:
     """Which column holds which measured signal, and how its values become deviations."""
@@ -53,6 +62,7 @@ class LogSignals:
     inputs: int = 0  # columns of known inputs
     delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
     units: Mapping[str, str] = field(default_factory=dict)  # of signals whose factor nobody states
+    in_header: dict[str, HeaderUnit] = field(default_factory=dict)  # by signal; filled in when a header is read
 
     @classmethod
     def of(
@@ -133,8 +143,10 @@ class LogSignals:
                     f"factor (--scale {shlex.quote(name)}=FACTOR).",
                     path=f"columns.{name}",
                 ) from error
-            if way is not None and way != (1.0, 0.0):
+            if way is not None:
                 factors[i], shifts[i] = way
+                self.in_header[names[i]] = HeaderUnit(unit, *way)
+            if way is not None and way != (1.0, 0.0):
                 stamps.notes.append(f"{name} is converted from {unit} to {self.units[name]}.")
         return factors, shifts
 

@@ -52,6 +52,9 @@ CHANGES = (
     ChangeOfUnit(-1.0, 0.0, "the other sign"),
 )
 
+#: Factors that differ by less are the same: each is a product of two.
+SAME_FACTOR = 1e-9
+
 #: A signal that is zero.
 NOTHING = ChangeOfUnit(0.0, 0.0, "")
 
@@ -87,16 +90,35 @@ class UnitCheck:
             path=f"columns.{explanation[0]}",
         )
 
-    @staticmethod
-    def words(name: str, change: ChangeOfUnit) -> str:
-        """Return that a signal is likely in another unit, and what to do about it."""
-        if change.shift:
-            remedy = f"convert its column, or name its unit in the header and in the plant: {name} (K)"
-        else:
-            option = f"--scale {shlex.quote(name)}={change.factor:.15g}"
-            remedy = f"give the factor ({option}, scales={{{name!r}: {change.factor:.15g}}})"
+    def words(self, name: str, change: ChangeOfUnit) -> str:
+        """Return that a signal is likely in another unit, and what to do about it.
+
+        A factor that is stated stands instead of the unit in a header, which the values were converted from."""
+        stated = self._signals.in_header.get(name)
+        factor, shift = change.factor, change.shift
+        if stated is not None:
+            factor, shift = change.factor * stated.factor, change.factor * stated.shift + change.shift
+        quoted = shlex.quote(name)
+        scale = f"(--scale {quoted}={factor:.15g}, scales={{{name!r}: {factor:.15g}}})"
         made = f"adding {change.shift:g}" if change.shift else f"multiplying by {change.factor:.6g}"
-        return f"The first rows of {name} do not fit the design, but would after {made} ({change.words}): {remedy}"
+        intro = f"The first rows of {name} do not fit the design, but would after {made} ({change.words})"
+        if (
+            stated is not None
+            and abs(factor - 1.0) < SAME_FACTOR
+            and abs(shift) < SAME_FACTOR * abs(stated.shift or 1.0)
+        ):
+            scale = f"(--scale {quoted}=1, scales={{{name!r}: 1}})"
+            plants = self._signals.units[name]
+            return (
+                f"{intro}: its header says {stated.unit}, and the values are in {plants} already; correct the header, "
+                f"or read them as they are {scale}"
+            )
+        if shift or change.shift:
+            known = (
+                "name its unit in the header and in the plant" if stated is None else "correct the unit in its header"
+            )
+            return f"{intro}: convert its column, or {known}: {name} (K)"
+        return f"{intro}: give the factor {scale}"
 
     def explanation(self, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
         """Return the signal and the change of its unit that explain the first of ``rows (n, nu + ny)``, which are not
