@@ -6,6 +6,7 @@ import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,9 @@ from scipy.signal import lfilter
 import obsynth
 from obsynth.cli.main import main
 from obsynth.monitoring.logs.stuck_sensors import RepeatedValues, Unrepeated, longest_repeats, stuck_rows
+from obsynth.monitoring.thresholds.learned_events import Event
+from obsynth.monitoring.thresholds.learned_from_rows import Raised
+from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows
 
 ROWS, EVENT = 1_500, slice(700, 709)
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
@@ -59,6 +63,21 @@ def test_an_event_that_raises_the_levels_is_told_with_its_rows(seed: int) -> Non
     ratio = np.sqrt(raised.levels[0] / usual.levels[0]) * usual.statistics.model.whitener[0, 0]
     assert told > 2.0
     assert told >= 0.8 * ratio / raised.statistics.model.whitener[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [(9.8, "9.8 times smaller"), (150.0, "150 times larger"), (5.6e10, "more than 1000 times larger")],
+)
+def test_levels_that_hide_every_fault_are_of_no_use(factor: float, told: str) -> None:
+    """A fault in a normal log was told as a change 5.6e+10 times smaller that would pass a level."""
+    stamps = SimpleNamespace(shown=lambda time: f"{time:g} s")
+    raised = Raised((Event(3, 5, 3, 5, "r[ya]"),), "T2", factor)
+    numbers, times = np.arange(10), 0.1 * np.arange(10)
+    (note,) = notes_of_normal_rows(raised, numbers, times, [(0, 10)], {}, [(0, 10)], [stamps])
+    assert told in note
+    assert "r[ya] in rows 3 to 5 (0.3 s to 0.5 s)" in note
+    assert note.startswith("These thresholds are of no use") == (factor > 100.0)
 
 
 def stretch_of(note: str) -> list[str]:

@@ -23,6 +23,10 @@ MOVES = 5.0
 AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
 
 
+#: Changes have to be so many times as large to be noticed beside events that are no noise: levels are of no use. A
+#: larger factor says no more of the plant than that.
+USELESS_FACTOR, MOST_TOLD_FACTOR = 100.0, 1000.0
+
 #: A level of an estimate that is not watched: its largest value without a fault, and half as much as room for others.
 ROOM_ABOVE = 1.5
 
@@ -52,11 +56,7 @@ def notes_of_normal_rows(
                 f"{event.signal} in {shown(int(numbers[event.first]), int(numbers[event.last]))}"
                 for event in raised.events
             )
-            yield (
-                f"What stands out of {where} raises the levels: without these rows, a change {raised.factor:.2g} times "
-                f"smaller would pass that of {raised.statistic!r}. Look whether the plant was as usual there; if it "
-                "was not, blank its outputs in these rows, or give another log."
-            )
+            yield _on_events(where, raised)
         runs_in_rows = {
             name: [(begin, end) for begin, end in runs if any(end >= a and begin < b for a, b in wanted)]
             for name, runs in stuck.items()
@@ -64,6 +64,23 @@ def notes_of_normal_rows(
         yield from stuck_texts(runs_in_rows, shown, ": what it repeats there counts as not measured")
 
     return tuple(notes())
+
+
+def _on_events(where: str, raised: Raised) -> str:
+    """Return what is to be known of events that stand out of rows ``where``."""
+    if raised.factor >= USELESS_FACTOR:
+        most = raised.factor > MOST_TOLD_FACTOR
+        times = f"more than {MOST_TOLD_FACTOR:.0f}" if most else f"{raised.factor:.3g}"
+        return (
+            f"These thresholds are of no use: what stands out of {where} is no noise (a fault, or wrong samples), and "
+            f"with it a change has to be {times} times larger to pass the level of {raised.statistic!r}. Blank its "
+            "outputs in these rows, or give another log."
+        )
+    return (
+        f"What stands out of {where} raises the levels: without these rows, a change {raised.factor:.2g} times "
+        f"smaller would pass that of {raised.statistic!r}. Look whether the plant was as usual there; if it "
+        "was not, blank its outputs in these rows, or give another log."
+    )
 
 
 def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
