@@ -374,6 +374,16 @@ def test_faults_that_a_disturbance_hides_are_refused() -> None:
             obsynth.optimal_filter(case, decoupled="d1", **options)
 
 
+def test_dependent_faults_are_refused_and_matched_as_the_refusal_says() -> None:
+    """Both faults are one signal to every output: f1 + f2 = s, of which each estimate is half."""
+    case = plant(A=[[0.0]], Bf=[[0, 0]], Bw=[[0]], C=[[0]], Df=[[1, 1]], Dw=[[0.1]])
+    with pytest.raises(obsynth.PreconditionError, match=r"told from each other, with.* match a reference model"):
+        obsynth.optimal_filter(case, delay=0)
+    design = obsynth.optimal_filter(case, reference=ONE, exact=False)
+    assert design.report.passed
+    assert design.gain == pytest.approx(1.0, rel=1e-6)  # of f1 = -f2, which no output shows
+
+
 @pytest.mark.long
 def test_the_statement_has_bounds_one_more_sample_and_the_limit() -> None:
     design = obsynth.optimal_filter(ZERO_AT_2, delay=1)
@@ -584,6 +594,46 @@ def test_weighted_faults_drive_the_error_of_matching() -> None:
     assert both.gain == pytest.approx(5.0 * truth, rel=1e-7)
 
 
+#: y1 = f1 + w1, y2 = f2 + w2, each a sample late.
+PAIR = plant(A=np.zeros((2, 2)), Bf=np.eye(2), Bw=np.eye(2), C=np.eye(2))
+MIXED = np.array([[1.0, 0.5], [0.0, 2.0]])
+MIXED_NUMBERS, LATE_PAIR = {"D": MIXED}, {"num": [1.0], "den": [1.0, 0.0]}
+
+
+def coupling(gain: np.ndarray, pole: float) -> control.StateSpace:
+    """Return a gain behind a lag beside it: ``(1 + 1 / (z - pole)) gain``."""
+    return control.ss(pole * np.eye(2), np.eye(2), gain, gain, True)
+
+
+@pytest.mark.parametrize("group", ["errors", "inputs"])
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_one_square_weight_couples_the_signals_of_a_group(group: str, norm: str, tmp_path) -> None:
+    """The error is the noise: its weighted gain is the norm of the weight, its weighted deviation that of the same."""
+    weight = coupling(MIXED, 0.25)
+    design = obsynth.optimal_filter(PAIR, delay=1, norm=norm, weights={group: weight})
+    assert obsynth.verify(obsynth.load(design.save(tmp_path / "a.gains.json"))).passed
+    # |1 + 1 / (z - 1 / 4)| is 7 / 3 at z = 1, where it is the largest; its impulse is 1, 1, 1/4, 1/16, ...
+    lag = 7.0 / 3.0 if norm == "hinf" else (1.0 + 1.0 / (1.0 - 0.0625)) ** 0.5
+    truth = lag * np.linalg.norm(MIXED, 2 if norm == "hinf" else "fro")
+    assert design.gain == pytest.approx(truth, rel=1e-6)
+    assert design.least == pytest.approx(truth, rel=1e-6)
+
+
+def test_one_square_weight_of_noise_and_faults_together_is_refused_and_each_by_its_name_is_not() -> None:
+    weight = coupling(MIXED, 0.25)
+    with pytest.raises(obsynth.SpecError, match="weigh each input by its name"):
+        obsynth.optimal_filter(PAIR, reference=LATE_PAIR, exact=False, weights={"inputs": weight})
+    with pytest.raises(obsynth.SpecError, match="or 2, for f1, f2"):
+        obsynth.optimal_filter(PAIR, delay=1, weights={"errors": {"D": np.eye(3)}})
+    with pytest.raises(obsynth.SpecError, match="errors has no stable inverse"):
+        obsynth.optimal_filter(PAIR, delay=1, weights={"errors": {"D": np.ones((2, 2))}})
+    design = obsynth.optimal_filter(PAIR, reference=LATE_PAIR, exact=False, weights={"errors": MIXED_NUMBERS})
+    assert design.report.passed
+    # f and w cannot be told from each other: half of what each does, sqrt 1/2 of both together.
+    assert design.gain == pytest.approx(0.5**0.5 * np.linalg.norm(MIXED, 2), rel=1e-6)
+    assert design.least == pytest.approx(0.5**0.5 * np.linalg.norm(MIXED, 2), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("weights", "words"),
     [
@@ -595,7 +645,7 @@ def test_weighted_faults_drive_the_error_of_matching() -> None:
         ({"inputs": {"w1": 0.0}}, "is zero"),
         ({"errors": {"f1": "much"}}, "a number"),
         ({"errors": {"f1": np.nan}}, "a number"),
-        ({"errors": {"f1": control.tf([1.0], [1.0, -0.5], True)}}, "no stable inverse"),
+        ({"errors": {"f1": control.tf([1.0], [1.0, -0.5], True)}}, "no stable inverse.*Multiply it by z"),
         ({"errors": {"f1": control.tf([1.0, -2.0], [1.0, -0.5], True)}}, "no stable inverse"),
         ({"inputs": {"w1": control.tf([1.0], [1.0, -1.5], True)}}, "not stable"),
         ({"inputs": {"w1": control.tf([1.0], [1.0, 1.5])}}, "dt"),
@@ -606,6 +656,14 @@ def test_weighted_faults_drive_the_error_of_matching() -> None:
 def test_weights_that_are_none_are_refused(weights, words) -> None:
     with pytest.raises(obsynth.SpecError, match=words):
         obsynth.optimal_filter(STATIC, delay=0, weights=weights)
+
+
+def test_a_weight_that_is_multiplied_by_z_has_its_size_and_a_stable_inverse() -> None:
+    """As the refusal of one that is strictly proper says."""
+    late = {"num": [0.5], "den": [1.0, -0.5]}
+    design = obsynth.optimal_filter(TWO, delay=0, weights={"errors": {"f1": {**late, "num": [0.5, 0.0]}}})
+    assert design.gain == pytest.approx(0.5**0.5, rel=1e-6)  # |0.5 / (z - 0.5)| is one at z = 1
+    assert design.least == pytest.approx(0.5**0.5, rel=1e-4)
 
 
 def test_claims_are_of_the_weights_that_are_stored(tmp_path) -> None:

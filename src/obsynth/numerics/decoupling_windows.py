@@ -143,9 +143,9 @@ def estimation_problem(
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
     # Remove the inputs that reach no output: they cannot be estimated and need not be decoupled.
     visible = seen_part(form.A, bh, form.C, dh)
-    wanted, reference = (
-        _distinguishable_faults(visible.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
-    )
+    wanted = np.zeros((0, nf))
+    if exact:
+        wanted, reference = _distinguishable_faults(visible.unseen[:nf], nf, reference, disturbed=nd > 0)
     a, c, bw = visible.states @ form.A @ visible.states.T, form.C @ visible.states.T, visible.states @ bw
     hidden = visible.states @ bh @ visible.inputs, dh @ visible.inputs
     selection = wanted @ visible.inputs[:nf] if exact else np.zeros((0, visible.inputs.shape[1]))
@@ -168,10 +168,13 @@ def estimation_problem(
     return EstimationProblem(*chained, window.length, form.alpha, form.shift)
 
 
-def _distinguishable_faults(unseen: FloatArray, nf: int, reference: Model | None) -> tuple[FloatArray, Model | None]:
+def _distinguishable_faults(
+    unseen: FloatArray, nf: int, reference: Model | None, *, disturbed: bool
+) -> tuple[FloatArray, Model | None]:
     """Return the combinations of faults that drive the reference model, and the model with these as inputs.
 
-    Raises `PreconditionError` where the outputs cannot distinguish them.
+    ``disturbed``: whether disturbances are decoupled.  Raises `PreconditionError` where the outputs cannot distinguish
+    the faults.
     """
     wanted = np.eye(nf)
     if np.linalg.norm(unseen) > WINDOW_IDENTITY and reference is not None:
@@ -183,7 +186,10 @@ def _distinguishable_faults(unseen: FloatArray, nf: int, reference: Model | None
         raise PreconditionError(
             "The faults cannot be told from each other and from the decoupled disturbances, with whatever delay: the "
             "transfer matrix from both to the outputs has too low a rank. Let a disturbance count as noise (leave it "
-            "out of decoupled), or measure more.",
+            "out of decoupled), or measure more."
+            if disturbed
+            else "The faults cannot be told from each other, with whatever delay: the transfer matrix from them to the "
+            "outputs has too low a rank. Measure more, or match a reference model (exact: false).",
             condition="decoupling",
         )
     return wanted, reference

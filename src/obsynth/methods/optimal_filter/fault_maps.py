@@ -197,7 +197,14 @@ def conditions(plant: DescriptorSystem, options: Options) -> tuple[Condition, ..
         return (first,)
     if not plant.nf:
         return first, Condition(
-            "faults", "the plant has a fault to be estimated", False, 0.0, 1.0, _SOURCE, of_the_method=True
+            "faults",
+            "the plant has a fault to be estimated",
+            False,
+            0.0,
+            1.0,
+            _SOURCE,
+            detail="it has none: state where faults enter (Bf, Df)",
+            of_the_method=True,
         )
     claim = "a stable causal filter has this fault map, whatever known and decoupled inputs do"
     try:

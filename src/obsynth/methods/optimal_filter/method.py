@@ -55,8 +55,10 @@ class OptimalFilterMethod(Method):
         ``{"errors": {"fault": weight}, "inputs": {"noise": weight}}``: what errors count, and the model that forms a
         disturbance or a noise (with ``exact=False`` also a fault) from a signal of unit energy.  Each weight is a
         number or a stable model of one input and one output, such as ``control.tf([1, 1], [1, 0.1])`` or
-        ``{"num": [1, 1], "den": [1, 0.1]}`` (highest power of s, or of z, first), or one for all of a group.  Weights
-        of errors pass at once and have strictly stable zeros.  All claims are then of the weighted problem.
+        ``{"num": [1, 1], "den": [1, 0.1]}`` (highest power of s, or of z, first).  One for all of a group is that of
+        each, or a square model that couples them, in their order: disturbances that are not decoupled come before the
+        noise (with ``exact=False`` for errors alone).  Weights of errors pass at once and have strictly stable zeros.
+        All claims are then of the weighted problem.
     order_limit : int, optional
         Most states of the filter, for small processors.  Where the filter of least gain has more, one of that order
         with the same fault map and decoupling is searched; its own gain is claimed beside ``least``, which is of

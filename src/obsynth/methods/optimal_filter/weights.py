@@ -1,8 +1,8 @@
-"""Weights of the errors, of the noise and of the faults: numbers or stable models, one for each signal.
+"""Weights of the errors, of the noise and of the faults: numbers or stable models, one for each signal or of a group.
 
 The gain of the weighted problem is that from n to ``We e``, where ``w = Ww n`` (and ``f = Wf n`` where faults drive
 the error).  A filter for ``We e`` gives ``We fhat``; the inverse of We behind it gives fhat, so that every We must pass
-at once and have strictly stable zeros.
+at once and have strictly stable zeros.  That of a group may be one square model that couples its signals.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from obsynth.methods.optimal_filter.stated_models import is_stated_model, model_
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.least_estimation import STABLE_RADIUS
+from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known
 
@@ -27,10 +28,13 @@ from obsynth.plants.signal_names import require_known
 PATH = f"{OPTIONS_PATH}.weights"
 #: What is weighted, by the names of the groups.
 ERRORS, INPUTS = "errors", "inputs"
+#: What is done about a transfer function with fewer zeros than poles.
+MORE_ZEROS = "For each zero that is missing add one beyond the frequencies that matter, as (0.001 s + 1) / (s + 1) has."
+MORE_ZEROS_SAMPLED = "Multiply it by z for each zero that is missing, which leaves its size at every frequency."
 
 
 class Weights(NamedTuple):
-    """Diagonal models: of the errors, of the noise, and of the faults where these drive the error."""
+    """Square models: of the errors, of the noise, and of the faults where these drive the error."""
 
     errors: Model | None
     noise: Model | None
@@ -52,18 +56,27 @@ def weights_of(option: Any, plant: DescriptorSystem, *, rows: int, exact: bool) 
     if not isinstance(option, Mapping) or not set(option) <= {ERRORS, INPUTS}:
         raise SpecError(
             "weights are {'errors': {'fault': weight}, 'inputs': {'noise': weight}}, each a number or a stable model "
-            "of one input and one output, such as control.tf([1, 1], [1, 0.1]).",
+            "of one input and one output, such as control.tf([1, 1], [1, 0.1]), or one square model of a group.",
             path=PATH,
         )
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-    errors = _by_name(option.get(ERRORS), names, plant, ERRORS)
-    for name, model in errors.items():
-        _require_inverse(model, plant, f"{ERRORS}.{name}")
+    coupled = _coupled(option.get(ERRORS), names, plant, ERRORS)
+    errors = {} if coupled is not None else _by_name(option.get(ERRORS), names, plant, ERRORS)
+    inverted = {f"{ERRORS}.{name}": model for name, model in errors.items()} if coupled is None else {ERRORS: coupled}
+    for name, model in inverted.items():
+        _require_inverse(model, plant, name)
     faults = () if exact else plant.fault_names
-    inputs = _by_name(option.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
+    noise = _coupled(option.get(INPUTS), plant.noise_names, plant, INPUTS)
+    if noise is not None and faults:
+        raise SpecError(
+            "One model of all inputs would weigh the noise together with the faults, which drive the error here too: "
+            "weigh each input by its name, or make the model that forms the noise part of the plant.",
+            path=f"{PATH}.{INPUTS}",
+        )
+    inputs = {} if noise is not None else _by_name(option.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
     weights = Weights(
-        _diagonal(errors, names),
-        _diagonal(inputs, plant.noise_names),
+        _diagonal(errors, names) if coupled is None else coupled,
+        _diagonal(inputs, plant.noise_names) if noise is None else noise,
         _diagonal(inputs, faults),
     )
     return None if weights == (None, None, None) else weights
@@ -79,7 +92,9 @@ def plain_weights(option: Any, plant: DescriptorSystem) -> Any:
         if isinstance(entry, Mapping) and not is_stated_model(entry):
             weights_by_group[group] = {str(name): _plain(one, plant, f"{group}.{name}") for name, one in entry.items()}
         elif entry is not None:
-            weights_by_group[group] = _plain(entry, plant, group)
+            is_number = is_finite_number(entry)
+            path = f"{PATH}.{group}"
+            weights_by_group[group] = float(entry) if is_number else plain(model_of(entry, plant, "weight", path))
     return weights_by_group
 
 
@@ -104,6 +119,23 @@ def in_series(first: Model, second: Model) -> Model:
 
 def _plain(entry: Any, plant: DescriptorSystem, name: str) -> Any:
     return float(entry) if is_finite_number(entry) else plain(_weight(entry, plant, name))
+
+
+def _coupled(entry: Any, names: tuple[str, ...], plant: DescriptorSystem, group: str) -> Model | None:
+    """Return the one square model of several signals, in their order; ``None`` for weights of one signal each."""
+    if entry is None or is_finite_number(entry) or (isinstance(entry, Mapping) and not is_stated_model(entry)):
+        return None
+    path = f"{PATH}.{group}"
+    model = model_of(entry, plant, "weight", path)
+    if model[3].shape == (1, 1):
+        return None
+    if model[3].shape != (len(names), len(names)):
+        raise SpecError(
+            f"The weight of all {group} has {model[3].shape[1]} inputs and {model[3].shape[0]} outputs: give one of "
+            f"each, or {len(names)}, for {', '.join(names)}.",
+            path=path,
+        )
+    return model
 
 
 def _by_name(entries: Any, names: tuple[str, ...], plant: DescriptorSystem, group: str) -> dict[str, Model]:
@@ -135,7 +167,7 @@ def _weight(value: Any, plant: DescriptorSystem, name: str) -> Model:
 
 def _require_inverse(model: Model, plant: DescriptorSystem, name: str) -> None:
     a, _, _, d = model
-    if d[0, 0] != 0.0:
+    if decide_rank(d, expected=len(d)).full:
         behind = inverse(model)[0]
         zeros = np.linalg.eigvals(behind) if len(a) else np.zeros(0)
         # Zeros on the boundary come out beside it, on either side.
@@ -145,7 +177,7 @@ def _require_inverse(model: Model, plant: DescriptorSystem, name: str) -> None:
     raise SpecError(
         f"The weight of {name} has no stable inverse: it must pass at once (as many zeros as poles) and its zeros must "
         "be strictly stable. A zero outside may be replaced by its mirror image: the size of the weight is the same. "
-        "For each zero that is missing add one beyond the frequencies that matter, as (0.001 s + 1) / (s + 1) has.",
+        f"{MORE_ZEROS_SAMPLED if plant.is_discrete else MORE_ZEROS}",
         path=f"{PATH}.{name}",
     )
 
