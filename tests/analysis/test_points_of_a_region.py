@@ -62,6 +62,24 @@ def test_a_fault_that_loses_its_effect_is_named_with_the_point() -> None:
         obsynth.fault_estimation_filter(PolytopicSystem(plant=plant, scheduling={"a": [-2, 2], "b": [-1, 2]}))
 
 
+@pytest.mark.parametrize("method", [obsynth.ui_pi_observer, obsynth.fault_estimation_filter], ids=["pi", "filter"])
+@pytest.mark.parametrize(
+    ("effect", "where"), [([["v - 0.3"], ["w - 0.6"]], "v = 0.3, w = 0.6"), ([["v"], ["w - 0.6"]], "v = 0, w = 0.6")]
+)
+def test_a_fault_whose_entries_vanish_together_inside_or_on_an_edge_is_named(
+    method: Callable[[PolytopicSystem], Any], effect: list[list[str]], where: str
+) -> None:
+    plant = {"A": [[0.9, "0.1 * w"], [0, "0.7 + 0.1 * v"]], "C": np.eye(2), "Bf": effect, "dt": 1.0}
+    with pytest.raises(PreconditionError, match=f"at {where}, where the fault 'f1' vanishes"):
+        method(PolytopicSystem(plant=plant, scheduling={"v": [0, 1], "w": [0, 1]}))
+
+
+def test_an_entry_that_vanishes_in_a_corner_of_the_region_alone_is_looked_at() -> None:
+    # v + w = 0.1 crosses no line through the middle of the square.
+    with pytest.raises(PreconditionError, match=r"at v = 0\.05, w = 0\.05, where an entry vanishes"):
+        obsynth.descriptor_kalman(hidden("v + w - 0.1", {"v": [0, 1], "w": [0, 1]}), Q=1.0, R=1.0)
+
+
 def test_faults_that_meet_in_one_direction_are_refused_though_no_entry_vanishes() -> None:
     plant = {"A": [["a", 0], [0, 0.5]], "C": np.eye(2), "Bf": [[1, "c"], [1, 1]], "dt": 1.0}
     with pytest.raises(PreconditionError, match=r"'effectiveness' fails.*give a smaller region"):

@@ -97,6 +97,16 @@ def test_a_scheduled_design_finds_the_fault_while_its_parameters_move() -> None:
     assert found is not None
 
 
+def test_a_parameter_that_is_an_output_moves_apart_from_it_and_that_is_said() -> None:
+    plant = obsynth.PolytopicSystem(
+        plant={"A": [["0.5 + 0.1 * level"]], "C": [[1]], "Bf": [[1]], "output_names": ["gauge"], "dt": 1.0},
+        scheduling={"level": {"range": [0, 1], "column": "gauge"}},
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    (note,) = obsynth.simulate(design, Scenario(horizon=20)).notes
+    assert note.startswith("In a log the parameter 'level' is the output 'gauge'; here it follows its profile")
+
+
 @pytest.mark.long
 def test_samples_faster_than_the_stated_rate_are_counted() -> None:
     design = obsynth.fault_estimation_filter(wang(rate=0.05))

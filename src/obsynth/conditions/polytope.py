@@ -29,7 +29,7 @@ Bernussou, Geromel, Syst. Control Lett. 37 (1999).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -322,8 +322,8 @@ class _Forms:
         """Return the inequalities at weights, by name."""
         errors = self.errors
         G = _mean(self.G, now)
-        GA = _mean([g.T @ a - y @ c for g, a, y, c in zip(self.G, errors.A, self.Y, errors.C, strict=True)], now)
-        GB = _mean([g.T @ b - y @ d for g, b, y, d in zip(self.G, errors.B, self.Y, errors.D, strict=True)], now)
+        GA = _mean_of(lambda i: self.G[i].T @ errors.A[i] - self.Y[i] @ errors.C[i], now)
+        GB = _mean_of(lambda i: self.G[i].T @ errors.B[i] - self.Y[i] @ errors.D[i], now)
         Z, Dz = _mean(list(errors.Cz), now), _mean(list(errors.Dz), now)
         if self.V is not None:
             Z, Dz = Z + self.V @ errors.C[0], Dz + self.V @ errors.D[0]
@@ -449,7 +449,12 @@ def descriptor_variables(n: int, k: int) -> tuple[Any, Any]:
 
 
 def _mean(parts: Sequence[Any], weights: FloatArray) -> Any:
+    return _mean_of(parts.__getitem__, weights)
+
+
+def _mean_of(part: Callable[[int], Any], weights: FloatArray) -> Any:
+    """Return the mean of what ``part`` makes of the vertices with a weight: of the others nothing is built."""
     used = np.flatnonzero(weights)
     if len(used) == 1 and weights[used[0]] == 1.0:
-        return parts[int(used[0])]
-    return sum(float(weights[i]) * parts[int(i)] for i in used)
+        return part(int(used[0]))
+    return sum(float(weights[i]) * part(int(i)) for i in used)

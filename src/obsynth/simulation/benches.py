@@ -24,6 +24,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign
@@ -283,10 +284,21 @@ def _scheduled_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         start,
         slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
-        () if plant.is_discrete else (INPUTS_OVER_REGION,),
+        (*(() if plant.is_discrete else (INPUTS_OVER_REGION,)), *_measured_scheduling(plant)),
         partial(scenario_runs_over_region, plant, drive, parameters, start),
         partial(_scheduled_rows, observer, None if observer.dt else drive.dt),
     )
+
+
+def _measured_scheduling(plant: PolytopicSystem) -> Iterator[str]:
+    """Yield for each parameter that is an output of the plant that a scenario moves both apart."""
+    scheduling = plant.scheduling
+    for name, column in zip(scheduling.names, scheduling.read_names, strict=True):
+        if column in plant.output_names:
+            yield (
+                f"In a log the parameter {name!r} is the output {column!r}; here it follows its profile of the "
+                "scenario, and the output follows the plant: the two differ."
+            )
 
 
 def _scheduled_rows(

@@ -10,7 +10,7 @@ product :math:`L(\mu) C(\mu)` would be of second degree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,14 +178,17 @@ class ErrorPolytope:
 
     def at(self, weights: FloatArray, gains: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
         """Return the closed M, B, Cz and Dz at weights, in floating point."""
-        each = list(gains) * (self.count if len(gains) == 1 else 1)
+        used = [int(i) for i in np.flatnonzero(weights)]
 
-        def mean(matrices: Sequence[FloatArray]) -> FloatArray:
-            return np.asarray(sum(w * matrix for w, matrix in zip(weights, matrices, strict=True)))
+        def closed(i: int, matrix: FloatArray, measured: FloatArray) -> FloatArray:
+            return np.asarray(matrix - gains[i if len(gains) > 1 else 0] @ measured)
 
-        A = mean([a - g @ c for a, g, c in zip(self.A, each, self.C, strict=True)])
-        B = mean([b - g @ d for b, g, d in zip(self.B, each, self.D, strict=True)])
-        return A, B, mean(self.Cz), mean(self.Dz)
+        def mean(part: Callable[[int], FloatArray]) -> FloatArray:
+            return np.asarray(sum(float(weights[i]) * part(i) for i in used))
+
+        A = mean(lambda i: closed(i, self.A[i], self.C[i]))
+        B = mean(lambda i: closed(i, self.B[i], self.D[i]))
+        return A, B, mean(self.Cz.__getitem__), mean(self.Dz.__getitem__)
 
 
 def driven_by(kind: type[Enclosed], B: FloatArray, gain: FloatArray, D: FloatArray) -> Enclosed:

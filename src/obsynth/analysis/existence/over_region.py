@@ -9,7 +9,7 @@ directions, ``Bf(mu) = Bf0 Delta(mu)`` with Delta nonsingular on the hull, and r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,10 @@ from obsynth.plants.polytopic import SCHEDULED_MATRICES, PolytopicSystem
 LEAST_SQUARES_ROUNDINGS = 16.0
 #: Points where an entry vanishes that are looked at: each costs as much as a vertex.
 MOST_VANISHING = 16
+#: Vertices up to which a point without a fault's effect is sought: beyond, the matrix of weights is large.
+MOST_HULL_VERTICES = 512
+#: A line through the hull: the words of a point on it, and the weights of its ends.
+Line = tuple[Callable[[float], str], FloatArray, FloatArray]
 _SOURCE = "over the region: Wang 2015 with constant T, N"
 #: exp(dt A(mu)) has no vertices: what helps a filter of samples where the plant is continuous.
 _CONTINUOUS = (
@@ -111,7 +115,8 @@ class FrozenPoint:
 
 
 def frozen_points(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
-    """Yield every vertex, the middle of the region, and points where an entry vanishes: a parameter may rest there."""
+    """Yield every vertex, the middle of the region, and points where a fault or an entry vanishes: a parameter may rest
+    there."""
     scheduling = plant.scheduling
     for place, vertex in enumerate(plant.vertices):
         yield FrozenPoint(scheduling.vertex_name(place), vertex, scheduling.is_linear)
@@ -124,17 +129,63 @@ def frozen_points(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
     )
     words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(scheduling.names, middle, strict=True))
     yield FrozenPoint(f"the middle of the region ({words})", plant.at(middle.tolist()))
+    yield from _vanishing_faults(plant)
     yield from _vanishing_entries(plant)
+
+
+def _vanishing_faults(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
+    """Yield a point of the hull, for each fault that has one, where all entries of the fault are zero together."""
+    stacked = np.array([np.vstack([vertex.Bf, vertex.Df]) for vertex in plant.vertices])
+    for fault in range(plant.nf):
+        columns = stacked[:, :, fault]
+        size = float(np.max(np.abs(columns)))
+        if size == 0.0 or plant.count > MOST_HULL_VERTICES or np.array_equal(columns.min(axis=0), columns.max(axis=0)):
+            continue
+        weights = _weights_of_zero(columns / size)
+        if weights is None:
+            continue
+        point = plant.mean(weights)
+        Bf, Df = np.array(point.Bf), np.array(point.Df)
+        Bf[:, fault], Df[:, fault] = 0.0, 0.0  # rounding of the mean leaves some 1e-17
+        yield FrozenPoint(
+            f"{_point_in_words(plant, weights)}, where the fault {plant.fault_names[fault]!r} vanishes",
+            point.replace(exact=None, Bf=Bf, Df=Df),
+            plant.scheduling.is_linear,
+        )
+
+
+def _weights_of_zero(columns: FloatArray) -> FloatArray | None:
+    """Return weights of the simplex with which rows add up to zero but for rounding, ``None`` where there are none."""
+    from scipy.optimize import nnls
+
+    count, length = columns.shape
+    weights, _ = nnls(np.vstack([columns.T, np.ones(count)]), np.append(np.zeros(length), 1.0))
+    if not weights.any():
+        return None
+    rounding = LEAST_SQUARES_ROUNDINGS * (count + length) * np.finfo(np.float64).eps
+    weights = np.where(weights > rounding * weights.max(), weights, 0.0)
+    weights = weights / weights.sum()
+    return np.asarray(weights) if np.max(np.abs(weights @ columns)) <= rounding else None
+
+
+def _point_in_words(plant: PolytopicSystem, weights: FloatArray) -> str:
+    """Return the values of the functions of the scheduling, or the weights themselves, at a mean of the vertices."""
+    scheduling = plant.scheduling
+    names = scheduling.names if scheduling.gives_weights else scheduling.functions
+    values = weights if scheduling.gives_weights else weights @ scheduling.corners
+    return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, values, strict=True))
 
 
 def _vanishing_entries(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
     """Yield points between two vertices, or along one function in the middle of the others, where an entry is zero."""
     scheduling, known = plant.scheduling, set[tuple[int, float]]()
-    for place, (name, first, last) in enumerate(_lines(plant)):
+    lines = [*_lines(plant)]
+    through_middle = 0 if scheduling.gives_weights and plant.count > 2 else len(lines)
+    for place, (name, first, last) in enumerate([*lines, *_lines_between_corners(plant, lines)]):
         ends = {key: _ends(plant, key, first, last) for key in SCHEDULED_MATRICES if not plant.is_constant(key)}
         shares = {key: _sign_changes(*pair) for key, pair in ends.items()}
         for share in sorted({float(each) for found in shares.values() for each in found[np.isfinite(found)]}):
-            if share == 0.5 or (place, share) in known:
+            if (share == 0.5 and place < through_middle) or (place, share) in known:
                 continue  # the middle is looked at already
             known.add((place, share))
             if len(known) > MOST_VANISHING:
@@ -149,7 +200,7 @@ def _vanishing_entries(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
             )
 
 
-def _lines(plant: PolytopicSystem) -> Iterator[tuple[Callable[[float], str], FloatArray, FloatArray]]:
+def _lines(plant: PolytopicSystem) -> Iterator[Line]:
     """Yield lines through the hull: the words of a point on it, and the weights of its ends."""
     scheduling, count = plant.scheduling, plant.count
     if scheduling.gives_weights:
@@ -172,6 +223,25 @@ def _lines(plant: PolytopicSystem) -> Iterator[tuple[Callable[[float], str], Flo
             return ", ".join(f"{text} = {low + at * (high - low):.6g}" for text, (low, high), at in pairs)
 
         yield values, at_low / at_low.sum(), ~at_low / (~at_low).sum()
+
+
+def _lines_between_corners(plant: PolytopicSystem, lines: Sequence[Line]) -> Iterator[Line]:
+    """Yield a line for each entry that changes its sign over the region, but not along any of ``lines``."""
+    for key in SCHEDULED_MATRICES:
+        if plant.is_constant(key):
+            continue
+        stacked = np.array([getattr(vertex, key) for vertex in plant.vertices])
+        missed = (stacked.min(axis=0) < 0.0) & (stacked.max(axis=0) > 0.0)
+        for _, first, last in lines:
+            missed &= ~np.isfinite(_sign_changes(*_ends(plant, key, first, last)))
+        for row, column in np.argwhere(missed):
+            entry = stacked[:, row, column]
+            first, last = np.eye(plant.count)[[int(np.argmin(entry)), int(np.argmax(entry))]]
+
+            def values(share: float, first: FloatArray = first, last: FloatArray = last) -> str:
+                return _point_in_words(plant, (1.0 - share) * first + share * last)
+
+            yield values, first, last
 
 
 def _ends(plant: PolytopicSystem, key: str, first: FloatArray, last: FloatArray) -> tuple[FloatArray, FloatArray]:

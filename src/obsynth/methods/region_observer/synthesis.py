@@ -13,8 +13,9 @@ from obsynth.analysis.existence.condition import require_all
 from obsynth.analysis.existence.nonlinear_region import MOST_CORNER_SLOPES
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.slope_multipliers import SlopedErrors
-from obsynth.errors import SolverError, SpecError
+from obsynth.errors import SolverError, SpecError, counted
 from obsynth.methods.engines.fastest_decay import fastest_rate
+from obsynth.methods.engines.needed_vertices import lack_of_decay, lack_of_level, solved_at_needed
 from obsynth.methods.engines.slope_certificates import best_decay_of_slopes, certified_slopes
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
@@ -73,9 +74,9 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
     given_gain = _given_gain(terms, asked.gains)
     progress("solving the inequalities for the slopes")
     problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
-    solution = problem.solved(asked, given_gain, solver)
+    solution = problem.solved(asked, given_gain, solver, progress)
     progress("proving the shipped numbers")
-    claims, matrices = _proved(terms, slopes, bounds, drive, solution, asked, problem)
+    claims, matrices = _proved(terms, slopes, bounds, drive, solution, asked, problem, progress)
     gain = solution.gain
     start = named_vector(asked.initial_state, (*plant.state_names, *faults), _nominal(plant, faults), "initial_state")
     places = [(*plant.state_names, *faults).index(name) for name in terms.names]
@@ -190,14 +191,16 @@ class _Scaled:
         sloped = SlopedErrors(errors, row_units * W * half, outputs[:, None] * Wy * half, V * states)
         return cls(errors if few else sloped, states, rows, outputs, time, nd)
 
-    def solved(self, asked: RegionObserverMethod, given: FloatArray | None, solver: str) -> _Solution:
+    def solved(
+        self, asked: RegionObserverMethod, given: FloatArray | None, solver: str, progress: Callable[[str], None]
+    ) -> _Solution:
         """Return a gain with its certificate."""
         own = None if given is None else self._gain_in(given)
         decay = None if not asked.decay else asked.decay * self.time
         if asked.goal == "decay":
             if decay is not None:
                 raise SpecError("goal: decay finds the fastest decay: leave decay out.", path="decay")
-            witness, gain = self._fastest(own)
+            witness, gain = self._fastest(own, progress)
             outside = self._witness_out(witness)
             return _Solution(self._gain_out(gain, given), outside, outside, None, ())
         options: dict[str, Any] = {
@@ -211,24 +214,35 @@ class _Scaled:
             block = certified_slopes(self.errors, gain=own, **options)
             of_level, of_decay = self._witness_out(block.witness), self._witness_out(block.of_decay)
             return _Solution(self._gain_out(block.gain, given), of_level, of_decay, block.level, block.runs)
-        made = certified(self.errors, gain="constant", gains=None if own is None else [own], **options)
+        corners, gains = self.errors, None if own is None else [own]
+        made = solved_at_needed(
+            corners,
+            lambda some: certified(some, gain="constant", gains=gains, **options),
+            lambda found: lack_of_level(corners, found, asked.goal, decay),
+            progress,
+        )
         witness = self._witness_out(made.witness)
         return _Solution(self._gain_out(made.gains[0], given), witness, witness, made.level, made.runs)
 
-    def decay_of(self, gain: FloatArray) -> Witness | None:
+    def decay_of(self, gain: FloatArray, progress: Callable[[str], None]) -> Witness | None:
         """Return Lyapunov matrices of the fastest decay of a gain; ``None`` where the search has no result."""
         try:
-            return self._witness_out(self._fastest(self._gain_in(gain))[0])
+            return self._witness_out(self._fastest(self._gain_in(gain), progress)[0])
         except SolverError:
             return None
 
-    def _fastest(self, gain: FloatArray | None) -> tuple[Witness, FloatArray]:
+    def _fastest(self, gain: FloatArray | None, progress: Callable[[str], None]) -> tuple[Witness, FloatArray]:
         """Return Lyapunov matrices of the fastest decay, of a gain or of the best one, and the gain."""
         if isinstance(self.errors, SlopedErrors):
             _, witness, best = best_decay_of_slopes(self.errors, gain=gain, limit=DECAY_LIMIT)
             return witness, best
-        gains = None if gain is None else [gain]
-        _, witness, own = best_decay(self.errors, gains=gains, gain="constant", limit=DECAY_LIMIT)
+        corners, gains = self.errors, None if gain is None else [gain]
+        _, witness, own = solved_at_needed(
+            corners,
+            lambda some: best_decay(some, gains=gains, gain="constant", limit=DECAY_LIMIT),
+            lambda found: lack_of_decay(corners, *found),
+            progress,
+        )
         return witness, own[0]
 
     def _gain_in(self, gain: FloatArray) -> FloatArray:
@@ -306,11 +320,12 @@ def _proved(
     solution: _Solution,
     asked: RegionObserverMethod,
     problem: _Scaled,
+    progress: Callable[[str], None],
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return what the shipped numbers prove: the decay and the level, each with Lyapunov matrices of its own."""
     vertices = corner_errors(terms, slopes, bounds, solution.gain, drive)
     wanted = asked.decay or 0.0
-    witness = problem.decay_of(solution.gain) or solution.of_decay
+    witness = problem.decay_of(solution.gain, progress) or solution.of_decay
     rate = fastest_decay(vertices, witness, _fastest(vertices, witness))
     if rate < wanted and prove_decay(vertices, solution.of_decay, wanted, discrete=False).proved:
         rate, witness = wanted, solution.of_decay
@@ -352,7 +367,7 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
     ]
     count = len(observer.slopes)
     kind = (
-        f"at {2**count} corners of {count} slopes"
+        f"at {counted(2**count, 'corner')} of {counted(count, 'slope')}"
         if count <= MOST_CORNER_SLOPES
         else f"in one block with a multiplier for each of {count} slopes (sufficient: a tighter claim may be true)"
     )
