@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -103,4 +103,5 @@ def _far_apart(errors: ErrorPolytope) -> list[int]:
 
 
 def _some(errors: ErrorPolytope, used: Sequence[int]) -> ErrorPolytope:
-    return replace(errors, **{name: [getattr(errors, name)[i] for i in used] for name in _PARTS})
+    parts: dict[str, Any] = {name: [getattr(errors, name)[i] for i in used] for name in _PARTS}
+    return replace(errors, **parts)
