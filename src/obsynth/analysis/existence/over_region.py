@@ -129,8 +129,8 @@ def frozen_points(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
     )
     words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(scheduling.names, middle, strict=True))
     yield FrozenPoint(f"the middle of the region ({words})", plant.at(middle.tolist()))
-    yield from _vanishing_faults(plant)
     yield from _vanishing_entries(plant)
+    yield from _vanishing_faults(plant)
 
 
 def _vanishing_faults(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
@@ -172,8 +172,14 @@ def _point_in_words(plant: PolytopicSystem, weights: FloatArray) -> str:
     """Return the values of the functions of the scheduling, or the weights themselves, at a mean of the vertices."""
     scheduling = plant.scheduling
     names = scheduling.names if scheduling.gives_weights else scheduling.functions
-    values = weights if scheduling.gives_weights else weights @ scheduling.corners
+    values = weights if scheduling.gives_weights else _cleaned_mean(weights, scheduling.corners)
     return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, values, strict=True))
+
+
+def _cleaned_mean(weights: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return the mean of corners, zero where it is rounding beside them."""
+    mean, sizes = weights @ corners, np.max(np.abs(corners), axis=0)
+    return np.where(np.abs(mean) > len(corners) * LEAST_SQUARES_ROUNDINGS * np.finfo(np.float64).eps * sizes, mean, 0.0)
 
 
 def _vanishing_entries(plant: PolytopicSystem) -> Iterator[FrozenPoint]:
