@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.monitoring.statement_lines import statement_lines
 from obsynth.plants.constants import constants_box, shown
 from obsynth.report.designs import promises
 from obsynth.report.headline import headline
@@ -97,6 +98,19 @@ def test_run_and_picture_say_the_same(design: obsynth.ObserverDesign) -> None:
     drawn = " ".join(axes[-1].texts[-1].get_text().split())
     assert drawn == f"The threshold: {watched.statement}."
     assert obsynth.run_on_data(design, data).statement == ""
+
+
+def test_a_statement_of_many_clauses_is_a_list() -> None:
+    assert statement_lines("The threshold: ", "never passed; held inputs") == [
+        "The threshold: never passed; held inputs."
+    ]
+    clauses = "alarms 1.5 rows apart count as one; as stated. Too few rows (9; 20 needed)"
+    assert statement_lines("", f"learned from 9 rows: one alarm per 7 rows; {clauses}") == [
+        "learned from 9 rows: one alarm per 7 rows.",
+        "  - alarms 1.5 rows apart count as one",
+        "  - as stated",
+        "  - Too few rows (9; 20 needed)",
+    ]
 
 
 def test_a_box_is_told_in_per_cent_or_by_its_ends() -> None:

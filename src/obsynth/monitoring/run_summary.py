@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from obsynth.files.tables import text_table
 from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence, time_in_alarm
+from obsynth.monitoring.statement_lines import statement_lines
 from obsynth.plants.signal_names import listed
 
 if TYPE_CHECKING:
@@ -37,9 +38,9 @@ def summary_of_run(run: DataRun, watched: Monitor | None, units: Mapping[str, st
     if watched is not None or run.thresholds or run.statement:
         lines += silence(run, watched.kind if watched else "any threshold")
     if watched is not None:
-        lines.append(f"The {watched.kind} threshold: {watched.statement}.")
+        lines += statement_lines(f"The {watched.kind} threshold: ", watched.statement)
     elif run.statement:
-        lines.append(f"The threshold: {run.statement}.")
+        lines += statement_lines("The threshold: ", run.statement)
     return "\n".join(lines)
 
 

@@ -72,9 +72,10 @@ def _target(options: argparse.Namespace, *, is_stream: bool) -> Path | None:
 
 def _lines(design: ObserverDesign, learned: LearnedThresholds) -> Iterator[str]:
     """Yield the lines that are printed: what the thresholds mean, what is monitored, and what is left out."""
+    from obsynth.monitoring.statement_lines import statement_lines
     from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_profiles
 
-    yield f"{learned.statement[0].upper()}{learned.statement[1:]}."
+    yield from statement_lines("", f"{learned.statement[0].upper()}{learned.statement[1:]}")
     yield f"Monitored: {', '.join(learned.columns)}."
     if learned.seldom:
         yield f"Left out (missing in most rows): {', '.join(learned.seldom)}."
