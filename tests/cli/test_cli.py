@@ -315,6 +315,7 @@ class TestEndings:
         [
             (main, ["thresholds", *FILES, "--false-alarm-rate", "1"], "Did you mean --false-alarms"),
             (main, ["run", *FILES, "--qqqq=7"], "there is no option --qqqq. See obsynth run"),
+            (main, ["run", *FILES, "-q"], "there is no option -q. Did you mean --quiet? See obsynth run"),
             (main, ["plot", *FILES, "more"], "it does not take 'more': see obsynth plot --help."),
             (design_command, ["--system", "spec.yaml", "--outptu=x"], "Did you mean --output"),
         ],

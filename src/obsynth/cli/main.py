@@ -69,6 +69,9 @@ exit codes:
   6  a check of the shipped gains failed
 """
 
+#: Most options that are suggested for a single letter.
+MOST_MEANT = 3
+
 #: Longest line of an example command, so that its margin and the closing backslash fit into 78 columns of help.
 WIDEST_COMMAND = 70
 
@@ -286,7 +289,15 @@ def _refuse_words(prog: str, verb: str, unknown: Sequence[str]) -> NoReturn:
     wrong = [word.partition("=")[0] for word in unknown if word.startswith("-") and word != "-"]
     if not wrong:
         own.error(f"it does not take {' '.join(map(repr, unknown))}: see {own.prog} --help.")
-    own.error(f"there is no option {wrong[0]}.{meant(wrong[0], known)} See {own.prog} --help.")
+    own.error(f"there is no option {wrong[0]}.{_meant_option(wrong[0], known)} See {own.prog} --help.")
+
+
+def _meant_option(word: str, known: Sequence[str]) -> str:
+    """Return a question with the options that begin with a single letter, or that are close to a misspelt one."""
+    if len(word) > len("-q"):
+        return meant(word, known)
+    beginning = [name for name in known if name.startswith(f"-{word}")]
+    return f" Did you mean {' or '.join(beginning)}?" if 0 < len(beginning) <= MOST_MEANT else ""
 
 
 def _outcome(options: argparse.Namespace) -> int:

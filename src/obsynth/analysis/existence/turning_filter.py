@@ -5,8 +5,8 @@ With constant ``T E + N C = I`` the corrected error obeys ``eps+ = (I - K(mu) C)
 .. math::
     K_i C T B_{f,j} + K_j C T B_{f,i} = T (B_{f,i} + B_{f,j}), \qquad i \le j.
 
-All these are ``[K_1, K_2] = K0 + R U'`` with one free R.  The faults are read off the outputs by a constant W, with
-which ``Delta(mu) = W C T Bf(mu)`` is nonsingular on the hull.
+All solutions are ``[K_1, K_2] = K0 + R U'`` with one free R.  A constant W gives the faults from the outputs, if
+``Delta(mu) = W C T Bf(mu)`` is nonsingular on the hull.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.polytopic import PolytopicSystem
 
-#: Vertices between which faults may turn: beyond two the equations are not tried.
+#: Number of vertices for which the equations are solved.
 TURNING_VERTICES = 2
-#: Name of the condition that is asked for turning faults alone.
+#: Name of the condition that only faults with a changing direction need.
 TURNING_CONDITION = "correction that turns"
 _SOURCE = "a correction that turns with the faults (obsynth.conditions.turning_faults)"
 
@@ -49,18 +49,18 @@ class TurningFilter:
 
 
 def has_turning_form(plant: PolytopicSystem) -> bool:
-    """Whether the plant is one for such a correction: two vertices, without Df and Dd."""
+    """Whether the plant has the form that this correction needs: two vertices, no Df and no Dd."""
     direct = any(np.any(getattr(vertex, name)) for vertex in plant.vertices for name in ("Df", "Dd"))
     return plant.count == TURNING_VERTICES and not direct
 
 
 def pairs_of_vertices(count: int) -> list[tuple[int, int]]:
-    """Return pairs ``i <= j``, whose products of weights make every point of what is of second degree."""
+    """Return the pairs ``i <= j``: a quadratic function of the weights is a mean of its values at these."""
     return [(i, j) for i in range(count) for j in range(i, count)]
 
 
 def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Condition]:
-    """Yield the conditions of a plant of that form; the parts go to ``made`` where all of them hold."""
+    """Yield the conditions of a plant of that form; append the filter's matrices to ``made`` if all of them hold."""
     yield Condition(
         "directions of the faults",
         "the faults turn with the scheduling, between two vertices: a correction may turn with them",
@@ -85,7 +85,7 @@ def turning_conditions(plant: PolytopicSystem, made: list[Any]) -> Iterator[Cond
     yield _correction_condition(plant, solvable)
     if not solvable:
         return
-    # Directions of the size one, so that the larger vertex does not outweigh the other.
+    # Unit directions, so that the larger vertex does not outweigh the other.
     mean = sum((C @ each / np.linalg.norm(C @ each, axis=0) for each in driven), np.zeros((plant.ny, plant.nf)))
     W = np.asarray(np.linalg.pinv(mean))
     Delta = tuple(W @ C @ each for each in driven)
@@ -137,9 +137,10 @@ def _correction_condition(plant: PolytopicSystem, solvable: bool) -> Condition:
 
 
 def _corrections(rows: FloatArray, target: FloatArray, rank: int) -> tuple[FloatArray, FloatArray]:
-    """Return the least K0 with ``K0 G = H``, and U with ``U' G = 0``: of G ``(N ny, pairs nf)`` with a decided rank.
+    """Return the least K0 with ``K0 G = H``, and U with ``U' G = 0``, for G ``(N ny, pairs nf)`` of known rank.
 
-    Equations in units of their own are as many as the rank counts; what is beyond it is rounding, and no direction."""
+    The equations are scaled to unit size; singular values beyond the rank are rounding.
+    """
     units = np.linalg.norm(rows, axis=0)
     units = np.where(units > 0.0, units, 1.0)
     left_vectors, sizes, right_vectors = np.linalg.svd(rows / units)

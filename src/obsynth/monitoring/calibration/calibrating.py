@@ -58,7 +58,7 @@ def calibrate(
 ) -> Calibration:
     r"""Fit constants and noise covariances of a plant to a log of rows without faults.
 
-    The start is a least-squares fit of simulations.  Then the likelihood of the innovations is made greatest,
+    The first step is a least-squares fit of simulations.  The second maximises the likelihood of the innovations,
 
     .. math::
         -\log p = \tfrac12 \sum_k e_k^T S_k^{-1} e_k + \log\det 2 \pi S_k , \qquad
@@ -71,61 +71,62 @@ def calibrate(
     model : DAEModel, DescriptorSystem or TimeVaryingDescriptorSystem
         ``nx`` states, ``nu`` inputs, ``ny`` outputs.  Linear plants hold their constants in entries that are
         expressions (`obsynth.uncertain_system`, or texts of a time-varying plant); constant faults and parameters may
-        be unknown too.  Their signals are deviations from the operating point, of which logs know nothing; ``k`` is
-        the row of the log.
+        be unknown too.  The log holds absolute values; the operating point is subtracted.  ``k`` is the row of the log.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
-        is missing.  Single outputs a hundred times further off than the others count as missing, and are reported.
+        is missing.  Single values of an output that are a hundred times further off than the others count as missing
+        and are reported.
     unknown : mapping of str to (low, high)
         Constants and parameters to estimate, with finite bounds around their nominal values; none (``{}``)
         to estimate the noise alone.
     priors : mapping of str to (mean, deviation), optional
-        What is known of them besides, as normal distributions.
+        Normal distributions of some of them, from other knowledge.
     noisy : list of str, optional
-        Equations to whose right sides noise is added in each step; all by default.
+        Equations with process noise; all by default.
     R, Q : mapping of str to float, optional
-        Variances that are known, by sensor and by noisy equation; the others are estimated.
+        Known variances, by sensor and by noisy equation; the others are estimated.
     initial_state : array_like or mapping, optional
-        ``(nx,)``, or values by name; by default nominal values, of linear plants zero.
+        ``(nx,)``, or values by name; by default nominal values, and zero for linear plants.
     initial_covariance : array_like or mapping, optional
-        ``(nx, nx)``, one variance, or variances by name.  By default deviations are 10 % of the nominal
-        sizes, or as far as the log begins elsewhere (a note says so); of linear plants, what alone would make outputs
-        as large as they are.
+        ``(nx, nx)``, one variance, or variances by name.  The default deviations are 10 % of the nominal sizes, or the
+        distance of the first row from the initial state if that is larger (a note says so).  For linear plants each
+        deviation alone explains the size of the outputs.
     rows : str, slice or pair, optional
-        ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
+        Rows without faults, as a slice of Python, such as ``"0:500"``; all by default.
     columns : mapping of str to str, optional
         Column of a signal, or of ``time``, where the names differ.
     scales : mapping of str to float, optional
-        What a column is multiplied by to be in the signal's unit.
+        Factor of a column that converts it to the signal's unit.
     dt : float, optional
         Seconds between rows; the median of the stamps by default.
     input_delay : int or "auto", optional
-        Rows by which the log's inputs act later than the convention says: ``u(k)`` during the step that ends at k, of
-        linear plants during the one that begins there.  ``"auto"`` takes the delay of which the likelihood is clearly
-        better, such as 1 of a log that writes what is sent at k: up to 3 are tried, and more while the last is best.
+        Rows by which the log's inputs act later than by convention: ``u(k)`` acts during the step that ends at k, and
+        for linear plants during the step that begins there.  ``"auto"`` takes a delay if its likelihood is
+        clearly better, such as 1 for a log that holds the command sent at k; up to 3 are tried, and more while the last
+        one is the best.
     method : {"innovations", "simulation"}, optional
-        The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
+        ``"simulation"`` stops after the fit of simulations; its boxes are too small if the residuals are not white.
     integration : {"auto", "backward-euler", "radau"}, optional
-        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation, or exact
-        steps would move a constant by half of its deviation; for linear plants in continuous time Radau.  Discrete
-        plants are stepped as they are.
+        ``"auto"`` takes backward Euler unless its error in one step exceeds a quarter of a sensor's deviation, or exact
+        steps would change a constant by half of its deviation.  Linear plants in continuous time take Radau, and
+        discrete plants their own steps.
     substeps : int, optional
-        Steps in a sample.
+        Steps of the integration in each sample.
     level : float, optional
         Probability of the box, for all constants at once.
     starts : int, optional
-        Fits of simulations, from the nominal constants and from random ones.
+        Number of fits of simulations: one from the nominal constants, the others from random ones.
     seed : int, optional
-        Of those.
+        Seed of the random ones.
     sensor_noise : mapping, optional
-        ``{y: {"correlation": seconds or "unknown"}}``: outputs whose noise is coloured, as in `with_noise`; white
-        noise is estimated beside it.  ``{}`` says that all noise is white.  By default coloured noise is taken where
-        the innovations ask for it and the likelihood says so, and is reported.
+        ``{y: {"correlation": seconds or "unknown"}}``: outputs with coloured noise, as in `with_noise`, in addition to
+        white noise, which is estimated.  ``{}``: all noise is white.  By default coloured noise is added, and reported,
+        if the innovations are not white and it raises the likelihood enough.
     offset : mapping or list of str, optional
-        Outputs with an offset that is not known; ``{}`` says that there is none.  By default as for ``sensor_noise``.
+        Outputs with an unknown offset; ``{}``: there is none.  The default is that of ``sensor_noise``.
     walks : mapping or list of str, optional
-        Unknown inputs, faults and parameters that walk at random; inputs of a nonlinear plant that no log holds.
-        Unknown inputs of linear plants by default as for ``sensor_noise``.
+        Unknown inputs, faults and parameters that are random walks; also inputs of a nonlinear plant that no log holds.
+        The default for unknown inputs of linear plants is that of ``sensor_noise``.
     progress : callable, optional
         Called with the name of each stage.
 
@@ -137,19 +138,19 @@ def calibrate(
     Raises
     ------
     SpecError
-        A name, a bound or an option is wrong; or the log is (``code``: ``irregular``, ``time``, ``nan``,
+        A name, a bound, an option or the log is wrong (``code`` for logs: ``irregular``, ``time``, ``nan``,
         ``too-short``).
     PreconditionError
-        ``not-exciting``: nothing moves.  ``explains-nothing``: the model cannot follow the log, for example as units
-        are off by 1000.  ``cannot-simulate``: it has no solution along the log's inputs.  ``undetermined-step``: a
-        step of a linear plant does not determine its state.
+        ``not-exciting``: no signal changes.  ``explains-nothing``: the model cannot follow the log, for example because
+        a unit is wrong by a factor of 1000.  ``cannot-simulate``: it has no solution for the log's inputs.
+        ``undetermined-step``: a step of a linear plant does not determine its state.
 
     References
     ----------
     .. [Ljung1999] L. Ljung, System Identification, 2nd ed., 1999, 7.2 and 10.1: prediction errors and their gradients.
     .. [Chung2013] Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters",
-       Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
-       cannot distinguish from it.
+       Psychometrika 78, 2013: the penalty that keeps variances from zero; here only for variances that the log cannot
+       distinguish from zero.
 
     Examples
     --------
@@ -244,14 +245,14 @@ def _require_numbers(level: Any, input_delay: Any) -> None:
 
 
 def _usable(record: RecordedLog, input_delay: int | str) -> RecordedLog:
-    """Return a log without samples of stuck sensors and wrong samples, its inputs shifted by a known delay."""
+    """Return the log without wrong samples and those of stuck sensors, with its inputs shifted by a known delay."""
     record = record.unstuck()
     record = record.without(wrong_samples(record.y))
     return record.shifted(input_delay) if isinstance(input_delay, int) else record
 
 
 def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
-    """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
+    """Return a nonlinear plant in which inputs that are random walks are parameters: no log holds them."""
     loads = [name for name in walks or () if isinstance(model, DAEModel) and name in model.inputs]
     if not loads:
         return model
@@ -272,7 +273,7 @@ def _by_name(value: Any, names: Sequence[str]) -> Any:
 
 
 def require_plant(model: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
-    """Return the plant whose matrices hold the constants: the one before elimination and sampling."""
+    """Return the plant as it was written, before elimination and sampling: its matrices hold the constants."""
     plant = getattr(model, "source", model)
     uncertainty = getattr(plant, "uncertainty", None)
     if uncertainty is not None and uncertainty.steps:

@@ -1,4 +1,4 @@
-"""The result of a calibration from a fit: tables by name, and tests of the innovations."""
+"""The result of a calibration, made from a fit: values by name, tests of the innovations, and a verdict."""
 
 from __future__ import annotations
 
@@ -48,17 +48,14 @@ def reported(
     result = fit if fit is not None else _of_simulation(problem, start, level)
     names, whitened = problem.names, result.whitened
     covariance = result.information.covariance
-    deviations = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(deviations, deviations)
+    correlation = _correlation(covariance)
     nis, colours, row = _tests_of_innovations(problem, whitened)
     box = _box(
         names, result, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
     )
     Q = {name: float(value) for name, value in zip(problem.noisy, result.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, result.R, strict=True)}
-    q, r = variance_names(problem.noisy, problem.output_names)
-    limits = zip((*q, *r), (*result.limited_Q, *result.limited_R), strict=True)
-    limited = [name for name, weak in limits if weak]
+    limited = _limited_variances(problem, result)
     at_end = tuple(name for name, is_at_end in zip(problem.unknown, result.at_bounds, strict=True) if is_at_end)
     verdict = (
         *problem.log.notes,
@@ -106,6 +103,19 @@ def reported(
         outlier_sizes=_outlier_sizes(problem.log, np.sqrt(np.median(result.variances, axis=0))),
         found_offsets=_fitted_offsets(problem, result),
     )
+
+
+def _correlation(covariance: FloatArray) -> FloatArray:
+    """Return the correlation matrix of a covariance."""
+    deviations = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(deviations, deviations))
+
+
+def _limited_variances(problem: CalibrationProblem, fit: InnovationsFit) -> list[str]:
+    """Return the variances of which the log gives an upper limit only, by name."""
+    q, r = variance_names(problem.noisy, problem.output_names)
+    limits = zip((*q, *r), (*fit.limited_Q, *fit.limited_R), strict=True)
+    return [name for name, is_limited in limits if is_limited]
 
 
 def _tests_of_innovations(
@@ -168,7 +178,7 @@ def _fitted_offsets(problem: CalibrationProblem, fit: InnovationsFit) -> dict[st
 
 
 def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> InnovationsFit:
-    """Return what the fit of a simulation says, in the form of a fit of innovations; its boxes are Wald's."""
+    """Return the fit of a simulation in the form of a fit of innovations; its boxes are Wald intervals."""
     error = SimulationError(problem)
     nt, scale = error.nt, error.scale
     inner = start.information
@@ -207,10 +217,10 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
 
 
 def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]:
-    """Return how far off an outlier of each output is at least, for innovations of ``deviations (ny,)``.
+    """Return the least size of an outlier of each output, for innovations of ``deviations (ny,)``.
 
-    One more outlier is nearer than all of n with the probability 1 / (n + 1): the size stands that share of the way, on
-    a logarithmic scale, from the least of them to what no sample of the model reaches.
+    A further outlier is smaller than all n known ones with the probability 1 / (n + 1).  On a logarithmic scale the
+    result lies that share of the way from the smallest known one to the largest sample that the model explains.
     """
     by_output = {}
     for name, sizes, deviation in zip(log.output_names, log.outliers, deviations, strict=False):

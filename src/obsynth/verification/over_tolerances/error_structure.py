@@ -3,7 +3,8 @@
     eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d,   eps = z - T E(q) x
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
 
-The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives them: what is known, and the error.
+The brackets vanish at the nominal plant.  Elsewhere in the box they are driven by ``x = xhat - e``: by the estimate,
+which is known, and by the error.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
 from obsynth.verification.error_system import IDENTITY_SHARE
 
-#: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
+#: Remainders below this share of the terms of their row are rounding and share one channel.
 REMAINDER_SHARE = 1e-9
 
 
@@ -119,14 +120,10 @@ def error_structure(
     noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
     disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
     if faults:
-        direct = stacked(affine.Bf, affine.Df)
-        columns = _fault_columns(direct, observer, c, n, affine.offsets)
-        earlier = np.array(observer.fault_delays, dtype=np.int64) > 0 if varying else np.zeros(nf, dtype=bool)
-        if earlier.any():
-            state, known, disturbances = (_with_more(item, count) for item in (state, known, disturbances))
-            columns = _at_earlier_samples(columns, earlier, count)
-            offsets = np.concatenate([offsets, offsets])
-        state = affine_block([[state, columns]])
+        columns = _fault_columns(stacked(affine.Bf, affine.Df), observer, c, n, offsets)
+        state, known, disturbances, offsets = _with_faults(
+            (state, known, disturbances), columns, observer, offsets, varying=varying
+        )
     if reading is not None:
         state, known = _with_missed(state, offsets), _with_missed(known, offsets)
         disturbances = _with_more(disturbances, 1)
@@ -154,6 +151,28 @@ def error_structure(
     )
 
 
+def _with_faults(
+    parts: tuple[AffineMatrix, AffineMatrix, AffineMatrix],
+    columns: AffineMatrix,
+    observer: LinearObserver,
+    offsets: FloatArray,
+    *,
+    varying: bool,
+) -> tuple[AffineMatrix, AffineMatrix, AffineMatrix, FloatArray]:
+    """Return the matrices of states with those of faults, of inputs and of disturbances, and the offsets.
+
+    ``varying``: late faults depend on the constants of an earlier sample, which are further constants.
+    """
+    state, known, disturbances = parts
+    count = columns.count
+    earlier = np.array(observer.fault_delays, dtype=np.int64) > 0 if varying else np.zeros(columns.shape[1], dtype=bool)
+    if earlier.any():
+        state, known, disturbances = (_with_more(item, count) for item in parts)
+        columns = _at_earlier_samples(columns, earlier, count)
+        offsets = np.concatenate([offsets, offsets])
+    return affine_block([[state, columns]]), known, disturbances, offsets
+
+
 def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
     """Return the size of the terms of each row, ``(rows, 1)``."""
     absolute = np.abs
@@ -166,7 +185,7 @@ def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: Floa
 
 
 def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
-    """Raise `PreconditionError` where the observer is none of the nominal plant."""
+    """Raise `PreconditionError` where the observer's identities do not hold on the nominal plant."""
     missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
     missed = float(np.maximum(missed, np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
     if not missed <= IDENTITY_SHARE:
@@ -178,12 +197,12 @@ def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatAr
 
 
 def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
-    """Return what a matrix that should vanish at the nominal plant is there, at least; its remainder may explain it."""
+    """Return a lower bound on a matrix at the nominal plant, where it should vanish, less its remainder."""
     return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
 
 
 def _require_every_fault(observer: LinearObserver, nf: int) -> None:
-    """Raise `PreconditionError` where faults of the plant are not estimated: they are no part of the error system."""
+    """Raise `PreconditionError` where a fault of the plant is not estimated: the error system has all of them."""
     if len(observer.fault_names) != nf:
         raise PreconditionError(
             "Not every fault is estimated, so none has a guaranteed interval.", condition="fault interval"
@@ -226,8 +245,10 @@ def _fault_columns(
 def _picked_rows(
     observer: LinearObserver, reading: FloatArray, back: FloatArray, *, nf: int, faults: bool, states: bool
 ) -> FloatArray:
-    """Return which rows of the observer's output are read ``(n + nf + watched, rows)``: its states, through
-    ``reading``; with ``faults`` all of these; then what is watched."""
+    """Return the selection ``(n + nf + watched, rows)`` of the observer's output rows.
+
+    The first rows are the states, by ``reading``; with ``faults`` the faults follow; the last are the watched rows.
+    """
     n, fault_rows = len(back), observer.fault_rows
     watched = list(range(n) if states else range(fault_rows.start, fault_rows.stop if faults else len(observer.Cz)))
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
@@ -240,7 +261,7 @@ def _picked_rows(
 
 
 def _at_earlier_samples(columns: AffineMatrix, earlier: NDArray[np.bool_], count: int) -> AffineMatrix:
-    """Return columns of faults, of which late ones have the constants of an earlier sample: as many constants more."""
+    """Return columns of faults in which late ones depend on the constants of an earlier sample, which are new ones."""
     doubled = _with_more(columns, count)
     doubled.parts[count:, :, earlier] = doubled.parts[:count, :, earlier]
     doubled.parts[:count, :, earlier] = 0.0
@@ -248,12 +269,12 @@ def _at_earlier_samples(columns: AffineMatrix, earlier: NDArray[np.bool_], count
 
 
 def _with_more(matrix: AffineMatrix, count: int) -> AffineMatrix:
-    """Return a matrix as a function of more constants, which it does not depend on."""
+    """Return a matrix as a function of ``count`` further constants, on which it does not depend."""
     return AffineMatrix(matrix.center, np.concatenate([matrix.parts, np.zeros((count, *matrix.shape))]), matrix.radius)
 
 
 def _with_missed(matrix: AffineMatrix, offsets: FloatArray) -> AffineMatrix:
-    """Return a matrix with what is left at the nominal plant as the part of one more constant."""
+    """Return a matrix whose value at the nominal plant is the part of one further constant."""
     missed = matrix.at(offsets)
     rounding = gamma(matrix.count + 3) * matrix.magnitude
     return AffineMatrix(
@@ -262,13 +283,13 @@ def _with_missed(matrix: AffineMatrix, offsets: FloatArray) -> AffineMatrix:
 
 
 def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the affine parts, which multiply ``q - offsets``, and what remains at the nominal plant."""
+    """Return the affine parts, which multiply ``q - offsets``, and a bound on the value at the nominal plant."""
     rounding = gamma(matrix.count + 2) * matrix.magnitude if offsets.any() else 0.0
     return matrix.parts, rounded_up(np.abs(matrix.at(offsets)) + matrix.radius + rounding, 3)
 
 
 def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
-    """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
+    """Return rows c, effects b (for the farthest value of a constant), owners, and a bound on the neglected parts."""
     rows_count, n = parts.shape[1:]
     rows, effects, owner, neglected = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
     for i, part in enumerate(parts):
@@ -291,7 +312,7 @@ def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Float
 
 
 def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray, int, FloatArray]:
-    """Return rows, how many of them are channels of their own, and effects: small remainders share one channel."""
+    """Return rows, the number of them with a channel of their own, and effects; small remainders share one channel."""
     n = rest.shape[1]
     share = (rest / sizes).max(axis=0, initial=0.0)
     large = np.flatnonzero(share > REMAINDER_SHARE)
