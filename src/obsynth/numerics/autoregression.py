@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value, read_only
 from obsynth.numerics.ranks import independent_directions
 
-#: Longest memory that is tried, and rows that each coefficient of an equation needs.
+#: Largest order that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
 
-#: A fit decays at least so fast: one that does not is shrunk by steps of the second number.
+#: Largest modulus of the roots of a fit; coefficients of one above it are multiplied by powers of the second number.
 SLOWEST_FIT, SHRINKING = 0.999, 0.99
 
-#: Share of the mean variance of regressors that is added so that nothing is singular.
+#: Ridge of the regression, as a share of the mean variance of the regressors.
 REGRESSOR_SHARE = 1e-10
 
-#: Share of what is new of a signal that the others of the same row must leave: of less, the most is what no
-#: autoregression says (gains that change with inputs), and a single row of it is worth hundreds of deviations.
+#: Least share of the variance of an innovation that the other signals of the same row leave unexplained.  Less than
+#: that is mostly an effect outside the model (gains that change with inputs), of hundreds of deviations in single rows.
 LEAST_OWN = 0.01
 
 #: Doublings after which the slowest fit (`SLOWEST_FIT`) has decayed to nothing.
 DOUBLINGS = 20
 
-#: Least variance of a direction of what is new, in a mean of one: below it, what signals that depend on each other
-#: leave is how they do, and not noise.
+#: Least variance of a direction of the innovations, relative to a mean of one.  A smaller one is a dependence between
+#: the signals, not noise.
 LEAST_NEW = 1e-3
 
 
@@ -45,7 +45,7 @@ class Autoregression:
 
     @property
     def order(self) -> int:
-        """Rows of the past that it takes."""
+        """Number of past rows in the regression."""
         return len(self.A)
 
     @property
@@ -55,24 +55,26 @@ class Autoregression:
 
     @cached_property
     def mean(self) -> FloatArray:
-        """What it tends to ``(m,)``."""
+        """Stationary mean ``(m,)``."""
         return np.asarray(np.linalg.solve(np.eye(self.channels) - self.A.sum(axis=0), self.offset))
 
     @property
     def longest_gain(self) -> float:
-        """Largest gain from an innovation that stays to the signals."""
+        """Largest gain from a constant innovation to the signals."""
         return largest_singular_value(np.linalg.inv(np.eye(self.channels) - self.A.sum(axis=0)))
 
     @property
     def is_regular(self) -> bool:
-        """Whether what is new of each signal is new beside the others: none nearly follows from them and the past."""
+        """Whether no signal nearly follows from the past and from the other signals of the same row."""
         precision = self.whitener.T @ self.whitener
         return bool((np.diag(precision) * np.diag(np.linalg.inv(precision)) < 1.0 / LEAST_OWN).all())
 
     @cached_property
     def rests_on_the_past(self) -> bool:
-        """Whether a signal is predicted to a tenth of its deviation: behind a row that is missing the prediction is off
-        by many times what it is otherwise, as of an estimate that follows exactly from the residuals before."""
+        """Whether a signal is predicted to a tenth of its deviation, as an estimate that follows from past residuals.
+
+        After a missing row the error of such a prediction is many times as large as otherwise.
+        """
         p, m = self.order, self.channels
         if not p:
             return False
@@ -86,7 +88,7 @@ class Autoregression:
         return bool((np.diag(new)[:m] < LEAST_OWN * np.diag(variance)[:m]).any())
 
     def whitened(self, x: FloatArray) -> FloatArray:
-        """Return e of rows ``(..., n, m)``: zero in the first p of them, NaN where a row that is needed is NaN."""
+        """Return the white innovations of rows ``(..., n, m)``: zero in the first p, NaN where a needed row is NaN."""
         residuals = x - self.offset
         for i, a in enumerate(self.A, 1):
             residuals[..., i:, :] -= x[..., :-i, :] @ a.T
@@ -94,7 +96,7 @@ class Autoregression:
         return np.asarray(residuals @ self.whitener.T)
 
     def simulated(self, e: FloatArray) -> FloatArray:
-        """Return the streams ``(runs, n, m)`` that white ones drive, from their mean."""
+        """Return the signals ``(runs, n, m)`` for white innovations e, from their mean on."""
         driven = e @ np.linalg.inv(self.whitener).T
         if not self.order:
             return np.asarray(driven + self.offset)
@@ -112,11 +114,11 @@ class Autoregression:
 
 
 def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregression:
-    """Return the autoregression of rows ``(n, m)``, of which some may be NaN, with the order of least criterion.
+    """Return the autoregression of rows ``(n, m)``, some of which may be NaN, with the order of least criterion.
 
-    Signals that depend on each other are fitted in the directions that are independent of each other.  The covariance
-    of what is new is shrunk towards that of independent signals, by as much as so few rows need (Ledoit & Wolf 2004),
-    and no direction of it counts as more certain than `LEAST_NEW` in a mean of one.
+    Linearly dependent signals are fitted in independent directions.  The covariance of the innovations is shrunk
+    towards that of independent signals by an amount that depends on the number of rows (Ledoit & Wolf 2004), and none
+    of its directions has a variance below `LEAST_NEW`, relative to a mean of one.
     """
     n, m = x.shape
     most = _most_order(np.asarray(np.isfinite(x).all(axis=1)), m) if order is None else order
@@ -153,7 +155,7 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
 
 
 def _most_order(known: NDArray[np.bool_], channels: int) -> int:
-    """Return the longest memory that rows determine of which some are ``known (n,)``: none where none follow others."""
+    """Return the largest order that the ``known (n,)`` rows determine; zero where no known row follows another."""
     after, longest = known, 0
     for order in range(1, MOST_ORDER + 1):
         after = after[1:] & known[:-order]
@@ -164,7 +166,7 @@ def _most_order(known: NDArray[np.bool_], channels: int) -> int:
 
 
 def _stable(a: FloatArray) -> FloatArray:
-    """Return coefficients ``(p, m, m)`` shrunk until the autoregression decays fast enough."""
+    """Return coefficients ``(p, m, m)`` shrunk until all roots are within `SLOWEST_FIT`."""
     p, m = a.shape[:2]
     powers = SHRINKING ** np.arange(1, p + 1)[:, None, None]
     while p:
@@ -176,13 +178,12 @@ def _stable(a: FloatArray) -> FloatArray:
 
 
 def _whitener(new: FloatArray, degrees: int) -> FloatArray:
-    """Return the whitener ``(m, m)``, lower triangular, of rows ``(n, m)`` of mean zero with so many degrees of
-    freedom."""
+    """Return the lower triangular whitener ``(m, m)`` of zero-mean rows ``(n, m)`` with ``degrees`` of freedom."""
     n, m = new.shape
     units = np.sqrt(np.maximum(np.sum(new**2, axis=0) / degrees, SMALLEST))
     rows = new / units
     covariance = rows.T @ rows / n
-    # Ledoit & Wolf (2004), with the target that the units make the identity.
+    # Ledoit & Wolf (2004); in these units the target is the identity.
     spread = float(np.sum((covariance - np.eye(m)) ** 2))
     error = float((np.sum(np.sum(rows**2, axis=1) ** 2) / n - np.sum(covariance**2)) / n)
     share = min(max(error / spread, 0.0), 1.0) if spread > 0.0 else 1.0

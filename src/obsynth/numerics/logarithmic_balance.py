@@ -15,35 +15,35 @@ from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.scaling import Scaling
 
-#: Makes the factors unique where one group of signals does not touch another; too small to move them.
+#: Ridge that makes the factors unique where groups of signals are not coupled; too small to change them otherwise.
 SMALL_RIDGE = 1e-9
 
-#: Makes the factors unique where nothing determines them; too small to move them elsewhere.
+#: Ridge that makes the factors unique where the entries leave them open; too small to change them otherwise.
 RIDGE = 1e-11
 
-#: Rounding of the largest weight may be this share of the ridge: corrections of the solution then gain two digits each.
+#: Largest rounding error of a weight, as a share of the ridge: each correction of the solution then gains two digits.
 ROUNDED_RIDGE = 1.0 / 64.0
 
 #: Weight of a wish in units of the ridge: it decides only what the entries leave open.
 WISH_WEIGHT = 1e3
 
-#: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
+#: An entry this many bits below one has half the weight: much smaller entries are weak coupling, or rounding.
 HALF_SAY = 10.0
 
-#: Corrections by exact residuals, each of which takes four or five digits of rounding away.
+#: Number of corrections by exact residuals, each of which gains four or five digits.
 RESIDUAL_CORRECTIONS = 3
 
-#: Whole exponents need no further correction once the last is below this share of the distance to where they change.
+#: Whole exponents are settled when the last correction is below this share of the distance to the next rounding limit.
 SETTLED_SHARE = 1e-2
 
-#: Passes in which small entries lose their say.
+#: Number of reweighting passes, in which small entries lose weight.
 PASSES = 3
 
-#: Bits after the point of what parts of sums are split into: of a million parts below 2^10 the sum of the first has 46
-#: bits, and those of the others have 50.
+#: Bits after the binary point of the parts into which summands are split.  Of a million summands below 2^10 the sum of
+#: the first parts has 46 bits, and those of the others have 50.
 PART_BITS = (16, 46, 76)
 
-#: From so many on a positive definite matrix is factored as one, in a third of the time.
+#: From this order on, Cholesky factors are tried first: they take a third of the time.
 MANY_UNKNOWNS = 500
 
 
@@ -111,7 +111,7 @@ class LogBalance:
         ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
         solved, exponents = self._solved(entries, weights, ridge)
         for _ in range(passes):
-            weights = entries.weights * entries.say(exponents)
+            weights = entries.weights * entries.influence(exponents)
             solved, exponents = self._solved(entries, weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
         for _ in range(RESIDUAL_CORRECTIONS):
@@ -126,7 +126,7 @@ class LogBalance:
     def _normal_residual(
         self, entries: _Entries, weights: FloatArray, exponents: FloatArray, ridge: float
     ) -> FloatArray:
-        """Return what is left of the normal equations."""
+        """Return the residual of the normal equations."""
         parts = _whole_parts(weights * entries.logarithms(exponents))
         missed = -ridge * exponents - sum(map(entries.sums, parts[::-1]))
         for unknown, exponent in self._wishes:
@@ -148,12 +148,12 @@ class LogBalance:
 
 
 def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves equations with a matrix ``(n, n)``, definite beyond rounding; what is given is lost."""
+    """Return a solver for equations with a matrix ``(n, n)``, definite beyond rounding; the matrix is overwritten."""
     if not matrix.size:
         return lambda right: right
     matrix = np.asarray_chkfinite(matrix)
     if len(matrix) >= MANY_UNKNOWNS:
-        # In the place of one half, from the other of which all is there again.
+        # The factor overwrites one triangle; the other one restores the matrix if this fails.
         diagonal = matrix.diagonal().copy()
         factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
         if not failed:
@@ -168,9 +168,10 @@ def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
 
 
 def _whole_parts(parts: FloatArray) -> list[FloatArray]:
-    """Return multiples of smaller and smaller powers of two whose sum is given, but for the last bits of small ones.
+    """Return multiples of decreasing powers of two whose sum is ``parts``, except for the last bits of small ones.
 
-    Sums of such multiples are exact: what enters two sums enters both with the same value."""
+    Sums of such multiples are exact, so that a summand of two sums has the same value in both.
+    """
     multiples = []
     for bits in PART_BITS:
         multiples.append(np.ldexp(np.rint(np.ldexp(parts, bits)), -bits))
@@ -193,7 +194,7 @@ class _Entries:
 
     @classmethod
     def joined(cls, terms: Sequence[_Entries], count: int) -> _Entries:
-        """Return the entries of all matrices, for so many unknowns."""
+        """Return the entries of all matrices, for ``count`` unknowns."""
         kinds = range(3 if any((term.places[2] < count).any() for term in terms) else 2)
         return cls(
             count,
@@ -210,12 +211,12 @@ class _Entries:
             totals += sign * known[place]
         return totals
 
-    def say(self, exponents: FloatArray) -> FloatArray:
-        """Return the say of each entry: all of it above one, less the further it is below."""
+    def influence(self, exponents: FloatArray) -> FloatArray:
+        """Return the weight of each scaled entry by its size: one for sizes from one on, less for smaller ones."""
         return np.asarray(1.0 / (1.0 + (np.minimum(self.logarithms(exponents), 0.0) / HALF_SAY) ** 2))
 
     def sums(self, parts: FloatArray) -> FloatArray:
-        """Return for each unknown the sum ``(count,)``, with signs, of what is given for the entries that it scales."""
+        """Return for each unknown the signed sum ``(count,)`` of the ``parts`` of the entries that it scales."""
         totals = np.zeros(self.count + 1)
         for place, sign in zip(self.places, self.signs, strict=True):
             totals += np.bincount(place, sign * parts, len(totals))

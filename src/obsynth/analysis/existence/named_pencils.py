@@ -31,19 +31,19 @@ from obsynth.plants.faults import Exosystem
 from obsynth.plants.plant_units import PlantUnits, sized_plant
 from obsynth.proofs.exact_doubles import written_fraction
 
-#: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
+#: Digits of the direction of a witness, tried in turn until the plant is within the tolerance.
 WITNESS_DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
 
-#: How much rather an entry is changed that is not zero, and one of E, whose ones are structure rather than data.
+#: Preference for changing a nonzero entry, and an entry of E, whose ones are structure rather than data.
 KNOWN_ENTRY, STRUCTURE = 8.0, 1e-2
 
-#: What stands at a place of a block matrix: a matrix of the plant, or columns of it, or nothing.
+#: One block of a block matrix: the name of a matrix of the plant, or none.
 Cell = str | None
 
 
 @dataclass(frozen=True, eq=False)
 class NamedPencil:
-    """``A - s E (m, n)`` with the entry of the plant that stands at each place of A."""
+    """A pencil ``A - s E (m, n)``, and for each entry of A the entry of the plant from which it comes."""
 
     A: Rational
     E: Rational
@@ -76,7 +76,7 @@ class NamedPencil:
 
     @cached_property
     def _weights(self) -> FloatArray:
-        """How much rather an entry is changed than others ``(m, n)``, zero for those that are no data."""
+        """Preference for changing each entry ``(m, n)``; zero for entries that are no data."""
         names = [0.0 if owner is None else STRUCTURE if owner[0] == "E" else 1.0 for owner in self.owners.ravel()]
         known: FloatArray = np.where(self.A != 0, KNOWN_ENTRY, 1.0) * np.reshape(names, self.A.shape)
         return known
@@ -89,12 +89,14 @@ class NamedPencil:
     def witness(
         self, tolerance: float, point: complex | None = None, *, dt: float | None = None, last: bool = False
     ) -> Witness | None:
-        """Return a plant for which this loses column rank at a point: within the tolerance, or the nearest one found.
-        With ``dt`` the point may move, but not become stable.  ``last``: the last column is to depend on the others."""
+        """Return a plant whose pencil loses column rank at a point: within the tolerance, or the nearest one found.
+
+        With ``dt`` the point may move, but not become stable.  ``last``: the last column shall depend on the others.
+        """
         at = 0j if point is None else complex(point)
         a, e = self._doubles
         matrix = a - (at if at.imag else at.real) * e
-        # Of the terms, not of what is left of them: at a point that rounding has moved off a mode that is nothing.
+        # Sizes of the terms, not of their differences: near a mode these cancel.
         sizes = (np.abs(a) if self.terms is None else self.terms) + abs(at) * np.abs(e)
         scaled = self.rows[:, None] * sizes * self.columns
         pencil = equilibrate_pencil(np.zeros_like(scaled), scaled)
@@ -118,7 +120,7 @@ class NamedPencil:
         return best if best is not None and np.isfinite(best.size) else None
 
     def last_share(self, point: complex) -> float:
-        """Return how much of the last column no combination of the others makes, beside the terms it is made of."""
+        """Return the distance of the last column from the span of the others, relative to the terms of that column."""
         a, e = self._doubles
         matrix = a - (point if point.imag else point.real) * e
         scaled = self.rows[:, None] * matrix * self.columns
@@ -132,7 +134,7 @@ class NamedPencil:
     def _changes(
         self, vector: tuple[Rational, Rational], point: tuple[Fraction, Fraction], rows: FloatArray, columns: FloatArray
     ) -> tuple[tuple[EntryChange, ...], float]:
-        """Return the changes that make a scaled vector a null vector, nothing where that cannot be, and their size."""
+        """Return the changes that make a scaled vector a null vector, and their size; none where that is impossible."""
         scale = rational(columns)
         real, imaginary = vector[0] * scale, vector[1] * scale
         # (A - s E) v, s = a + b j.
@@ -205,9 +207,9 @@ def _rounded(vector: ComplexArray | FloatArray, digits: int) -> tuple[Rational, 
 
 
 def _placed(point: complex, digits: int, dt: float | None) -> tuple[Fraction, Fraction]:
-    """Return a point rounded to some digits, on or outside the stability boundary; without ``dt`` to almost all."""
+    """Return a point rounded to ``digits``, not inside the stability boundary; without ``dt`` to almost all digits."""
     if dt is None and digits < WITNESS_DIGITS[-2]:
-        # An eigenvalue that was computed of a matrix of short numbers.
+        # The point may be a computed eigenvalue of a matrix of short numbers: drop its rounding.
         return Fraction(f"{point.real:.13g}"), Fraction(f"{point.imag:.13g}")
     if dt is None:
         return written_fraction(point.real), written_fraction(point.imag)

@@ -21,9 +21,9 @@ from obsynth.plants.operating_region import OperatingRegion, Slope
 from obsynth.plants.signal_names import leading_names
 from obsynth.plants.transformations.nonlinear_terms import ARGUMENT, NonlinearTerms, nonlinear_terms
 
-#: Slopes whose corners are looked at one by one: 2 ** 12 = 4096.
+#: Most slopes whose corners are examined one by one: 2 ** 12 = 4096.
 MOST_CORNER_SLOPES = 12
-#: Slopes of one block: with the errors, and what drives them, matrices of order 128 are proved.
+#: Most slopes of one block: with errors and their inputs, definiteness of matrices of order 128 is proved.
 MOST_SLOPES = 64
 _SOURCE = "observer over a region"
 
@@ -82,7 +82,7 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
 def _of_the_form(
     name: str, claim: str, detail: str, *, value: float = 0.0, needed: float = 1.0, signals: Sequence[str] = ()
 ) -> Condition:
-    """Return a condition on the form of plant and region, which the method needs; it holds at the ``needed`` value."""
+    """Return a condition of the method on the form of plant and region; it holds if ``value`` is ``needed``."""
     return Condition(
         name, claim, value == needed, value, needed, _SOURCE, detail, signals=tuple(signals), of_the_method=True
     )
@@ -91,9 +91,9 @@ def _of_the_form(
 def _at_values_of_the_slopes(
     terms: NonlinearTerms, place: OperatingRegion, slopes: Sequence[Slope]
 ) -> Iterator[Condition]:
-    """Yield what must hold at single values of the slopes: at corners, in the middle, and where one is zero."""
+    """Yield the conditions at single values of the slopes: at corners, in the middle, and where one is zero."""
     bounds = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
-    # Of more slopes the block that is proved holds the algebraic equations, too.
+    # With more slopes the algebraic equations are part of the block that is proved.
     if terms.differential < len(terms.names) and len(slopes) <= MOST_CORNER_SLOPES:
         yield _algebraic_states(terms, slopes, bounds)
     middle = bounds.mean(axis=1)
@@ -104,7 +104,7 @@ def _at_values_of_the_slopes(
         if not condition.holds:
             text = terms.nonlinearities[slopes[k].nonlinearity].expression.text
             which = place.in_signals(f"This is where the slope of {text!r} by {ARGUMENT}{slopes[k].argument} is zero.")
-            # Slopes of several nonlinearities need not take these values together.
+            # Slopes of several nonlinearities need not take these values at the same time.
             yield replace(condition, of_the_method=True, detail=f"{condition.detail}. {which}")
             return
 
@@ -149,9 +149,9 @@ def _algebraic_states(terms: NonlinearTerms, slopes: Sequence[Slope], bounds: Fl
 def _detectable(
     terms: NonlinearTerms, slopes: Sequence[Slope], values: FloatArray, where: str, claim: str
 ) -> Condition:
-    """Return whether every mode that does not decay is seen at values of the slopes.
+    """Return whether every mode that does not decay is observable at values of the slopes.
 
-    Where one is not, no gain makes the errors decay there, so that there is no certificate over the region.
+    Otherwise no gain makes the errors decay there, and no certificate over the region exists.
     """
     A, C = _at_slopes(terms, slopes, values)
     E = np.diag([float(place < terms.differential) for place in range(len(A))])

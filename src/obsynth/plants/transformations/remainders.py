@@ -1,7 +1,7 @@
 r"""The sampled linear model of a nonlinear plant, with a bound on its error over a region.
 
-The equations are evaluated in affine arithmetic over the region: what is not linear is bounded, with all rounding.
-Between samples it may do anything within its bound:
+The equations are evaluated in affine arithmetic over the region, which bounds their nonlinear part and all rounding.
+Between samples the nonlinear part may take any value within its bound:
 
 .. math::
     \xi_{k+1} = A \xi_k + B u_k + B_f f_k + \rho_k, \qquad
@@ -31,10 +31,10 @@ from obsynth.proofs.affine import AffineMatrix, affine_block, affine_exponential
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
 
-#: Parts of a sample over which what moves within it is bounded.
+#: Parts of a sampling interval in which the motion between samples is bounded.
 PARTS_OF_SAMPLE = 32
 
-#: Roundings of the coefficients of derivatives, which CasADi computes.
+#: Rounding errors of the coefficients of derivatives, which CasADi computes.
 COEFFICIENT_ROUNDINGS = 16.0
 
 
@@ -48,10 +48,10 @@ def bounded_model(
     given: Mapping[str, float] | None = None,
     shipped: DescriptorSystem | None = None,
 ) -> tuple[DescriptorSystem, Mapping[str, float]]:
-    """Return the sampled linear model at an equilibrium, whose last disturbances stand for what it leaves out, and the
-    bounds of these by name; ``shipped``: bound what this one leaves out, instead of a new one.
+    """Return the sampled linear model at an equilibrium, and bounds on its remainders by name.
 
-    ``region``: ``[low, high]`` of every state, input and fault; others have their nominal values.
+    The last disturbances of the model are the remainders.  ``shipped``: the model to bound, instead of a new one.
+    ``region``: ``[low, high]`` of every state, input and fault; all else has its nominal value.
     """
     if not model.is_data or callable(model.outputs):
         raise SpecError("The model is given as functions: its remainder needs equations as texts.", path="plant")
@@ -102,13 +102,13 @@ def continuous_model(
 
 
 def remainder_names(plant: DescriptorSystem) -> list[str]:
-    """Return what stands for the remainder in each state and each output."""
+    """Return the names of the remainders of all states and outputs."""
     into = [f"remainder of {name}" for name in plant.state_names]
     return [*into, *(f"remainder in {name}" for name in plant.output_names)]
 
 
 def require_linear_rates(model: DAEModel) -> None:
-    """Raise `PreconditionError` where derivatives enter with other coefficients than constants."""
+    """Raise `PreconditionError` where the coefficient of a derivative is not constant."""
     s = symbols_of(model)
     into, stored = ca.jacobian(s.equations, s.rates), ca.jacobian(s.stored, s.x)
     moved = ca.depends_on(s.stored, ca.vertcat(s.theta, s.u)) if s.stored.numel() else False
@@ -167,7 +167,7 @@ def _remainders(
     halves: FloatArray,
     given: Mapping[str, float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of what each equation and each output leaves out ``(nx,)``, ``(ny,)``."""
+    """Return bounds on the remainders of the equations ``(nx,)`` and of the outputs ``(ny,)``."""
     count = len(signals)
     translation, zero = affine_translation(count), AffineNumber(0.0, np.zeros(count), 0.0)
     known: dict[str, Any] = {name: zero.lifted(value) for name, value in model.constants.items()}
@@ -196,7 +196,7 @@ def _remainders(
 
 
 def _missed(value: AffineNumber, row: FloatArray, offset: float, middles: FloatArray, halves: FloatArray) -> float:
-    """Return how far a number is from ``offset + row (middles + halves q)`` at most."""
+    """Return an upper bound on the distance of a value from ``offset + row (middles + halves q)``."""
     constant, parts = value.center - offset - row @ middles, value.parts - row * halves
     size = abs(value.center) + abs(offset) + np.abs(row) @ (np.abs(middles) + halves) + np.abs(value.parts).sum()
     total = abs(constant) + np.abs(parts).sum() + value.radius + gamma(len(row) + 8) * size
@@ -210,7 +210,7 @@ def _sampled(
     left_out: tuple[FloatArray, FloatArray],
     sizes: Mapping[str, float],
 ) -> dict[str, float]:
-    """Return the bounds of what a shipped sampled model leaves out, by name; ``sizes``: of all deviations."""
+    """Return bounds on the remainders of a shipped sampled model, by name; ``sizes``: of all deviations."""
     equations, outputs = left_out
     nx, nu, nf, nd = linear.nx, linear.nu, linear.nf, linear.nd
     written = {**matrices_of(linear)}
@@ -234,14 +234,14 @@ def _sampled(
 
 
 def _away(enclosure: AffineMatrix, shipped: FloatArray) -> FloatArray:
-    """Return how far a proved matrix is from a shipped one at most."""
+    """Return an entrywise upper bound on the distance of an enclosed matrix from a shipped one."""
     return rounded_up(np.abs(enclosure.center - shipped) + enclosure.radius + UNIT_ROUNDOFF * np.abs(shipped), 4)
 
 
 def _moving(a: AffineMatrix, sizes: FloatArray, step: float) -> FloatArray:
-    """Return what disturbances of these sizes, which do anything within a sample, do to the states at its end."""
+    """Return a bound on the states after a sample for disturbances of these sizes and any course within it."""
     piece = step / PARTS_OF_SAMPLE
-    # Within a piece e^(A s) is away from its begin by e^(|A| s) - 1 times that.
+    # Within a piece e^(A s) differs from its value at the start by at most e^(|A| s) - 1 times that value.
     spread = affine_exponential(AffineMatrix.exact(a.magnitude * (piece * (1.0 + 4.0 * UNIT_ROUNDOFF)), 0)).magnitude
     over = affine_exponential(a.scaled(piece))
     here, total = AffineMatrix.exact(np.eye(len(sizes)), 0), np.zeros(len(sizes))
