@@ -61,6 +61,22 @@ def test_the_output_is_used_and_the_derivative_is_an_input_that_is_named(plant, 
     assert "derivative of u" in str(obsynth.check(plant)["ui-pi-observer"])
 
 
+def test_samples_of_such_a_plant_have_the_derivative_as_an_input_too(plant, log):
+    sampled = obsynth.discretise(plant, STEP).plant
+    assert sampled.input_names == ("u", "derivative of u")
+    # y1 = x, y2 = x + 2 u', x' = -x + u: the derivative acts at the samples alone.
+    np.testing.assert_allclose(sampled.A, [[math.exp(-STEP)]])
+    np.testing.assert_allclose(sampled.B, [[1.0 - math.exp(-STEP), 0.0]])
+    np.testing.assert_allclose(sampled.D, [[0.0, 0.0], [0.0, 2.0]], atol=1e-15)
+    found = obsynth.ui_pi_observer(obsynth.discretise(plant, STEP))
+    assert found.report.passed
+    run = obsynth.run_on_data(found, log)
+    assert "derivative of u is formed from u by differences from row to row." in run.warnings
+    exact = obsynth.run_on_data(found, log, columns={"derivative of u": "slope"})
+    # An input that moves is held for half a step too long on average: half of 0.05 times its slope, 0.5 at most.
+    assert abs(estimates(exact)[-1] - SIZE) < 2.0 * 0.5 * STEP * 0.5
+
+
 def test_a_log_gives_the_derivative_and_what_differences_lose_is_bounded(design, log):
     run = obsynth.run_on_data(design, log)
     assert "derivative of u is formed from u by differences from row to row." in run.warnings

@@ -21,6 +21,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delayed_signals import sampled_with_delays
 from obsynth.plants.transformations.elimination import columns_of, eliminate_algebraic_states
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO, sampled_exact_numbers
+from obsynth.plants.transformations.index_reduction import with_input_derivatives
 from obsynth.plants.transformations.recovery import Transformation, unchanged_states
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.proofs.extended_balls import arb_matrix
@@ -41,14 +42,15 @@ def discretise(plant: DescriptorSystem | Transformation | PolytopicSystem, sampl
 
     Exact for inputs, faults and disturbances that are constant between samples, and for delays (``plant.delays``) of
     any length: samples on their way become states, and a sample is split where a delayed input changes or a delayed
-    output is taken.  Algebraic states are eliminated first.  A fault that changes within an interval acts there like
-    its mean over it, weighted by how much of the effect of each moment is left at the next sample: for short intervals
-    the plain mean.
+    output is taken.  Algebraic states are eliminated first.  A derivative of a known input that an output needs becomes
+    a known input of its own, ``derivative of u``, which acts at the samples.  A fault that changes within an interval
+    acts there like its mean over it, weighted by how much of the effect of each moment is left at the next sample: for
+    short intervals the plain mean.
 
     Parameters
     ----------
     plant : DescriptorSystem
-        Continuous, regular, index 0 or 1.
+        Continuous and regular.
     sample_time : float, seconds
         Time between samples.
 
@@ -64,8 +66,8 @@ def discretise(plant: DescriptorSystem | Transformation | PolytopicSystem, sampl
         ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
         within it, or a delay is hundreds of samples.
     PreconditionError
-        A polytopic plant, whose samples have no vertices; as for `eliminate_algebraic_states`; or continuous white
-        noise reaches an output directly.
+        A polytopic plant, whose samples have no vertices; as for `eliminate_algebraic_states`, but for derivatives of
+        known inputs; or continuous white noise reaches an output directly.
 
     References
     ----------
@@ -100,7 +102,7 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
     real_number(sample_time, "sample_time", "a positive number of seconds", above=0.0)
     require_no_overflow(sample_time, "sample_time", "sample_time")
-    first = eliminate_algebraic_states(plant)
+    first = _proper(plant)
     smooth = first.plant
     direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
     process = np.flatnonzero(np.any(dense(plant.Bw), axis=0) | np.any(smooth.Bw, axis=0))
@@ -133,6 +135,17 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
     note_source(smooth, sampled, sample_time=float(sample_time))
     step = Transformation(smooth, sampled, _described(sample_time), recovery)
     return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _proper(plant: DescriptorSystem) -> Transformation:
+    """Return a plant without algebraic states; derivatives of known inputs that its outputs need are inputs then."""
+    try:
+        return eliminate_algebraic_states(plant)
+    except PreconditionError as refusal:
+        reduced = with_input_derivatives(plant) if refusal.condition == "index" else None
+        if reduced is None:
+            raise
+        return reduced[0]
 
 
 def _described(sample_time: float) -> str:
