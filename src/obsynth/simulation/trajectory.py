@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from obsynth.errors import counted
 from obsynth.numerics.arrays import FloatArray, freeze
 
 
@@ -55,6 +56,13 @@ class Trajectory:
     time: FloatArray = field(default_factory=_no_signals)
     inconsistency: float = 0.0
     residuals: FloatArray = field(default_factory=_no_signals)
+
+    def __repr__(self) -> str:
+        """Return what it holds, without the numbers."""
+        parts = {"state": self.states, "output": self.outputs, "input": self.inputs, "fault": self.faults}
+        signals = ", ".join(counted(part.shape[1], name) for name, part in parts.items() if part.shape[1])
+        length = f" over {self.time[-1]:g} s" if self.time.size else ""
+        return f"<Trajectory of {counted(len(self.states), 'sample')}{length}: {signals}>"
 
     def __post_init__(self) -> None:
         freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))

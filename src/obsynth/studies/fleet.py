@@ -123,6 +123,13 @@ class Fleet(ResultTable):
 
     runs: tuple[FleetRun, ...]
 
+    def __repr__(self) -> str:
+        """Return the table as text."""
+        from obsynth.results.layout import printed
+        from obsynth.studies.printed_cases import printed_runs
+
+        return printed(lambda console: console.print(printed_runs(self, console.width, rest="table()")))
+
     @property
     def _results(self) -> Sequence[FleetRun]:
         return self.runs

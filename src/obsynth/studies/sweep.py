@@ -125,6 +125,13 @@ class Sweep(ResultTable):
 
     results: tuple[SweepResult, ...]
 
+    def __repr__(self) -> str:
+        """Return the table as text."""
+        from obsynth.results.layout import printed
+        from obsynth.studies.printed_cases import printed_cases
+
+        return printed(lambda console: console.print(printed_cases(self, console.width, rest="table()")))
+
     @property
     def _results(self) -> Sequence[SweepResult]:
         return self.results

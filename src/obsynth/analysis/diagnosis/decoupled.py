@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits, finite_values, left_part
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
@@ -97,6 +97,12 @@ class DecoupledPlant:
     signal_sizes: FloatArray
     time: float
     decisions: tuple[RankDecision, ...]
+
+    def __repr__(self) -> str:
+        """Return what was removed and what is left, without the matrices."""
+        removed = ", ".join(self.without) or "nothing"
+        left = f"{counted(self.order, 'state')} and {counted(len(self.C), 'output')} for {', '.join(self.faults)}"
+        return f"<DecoupledPlant without {removed}: {left}>"
 
     @property
     def order(self) -> int:

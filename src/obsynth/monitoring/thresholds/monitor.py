@@ -244,6 +244,10 @@ class Monitor:
     watches_estimates: bool = False
     groups: tuple[tuple[str, ...], ...] = ()
 
+    def __repr__(self) -> str:
+        """Return which monitor it is, and what its threshold means."""
+        return f"<Monitor {self.kind}: {self.statement}>"
+
     @property
     def threshold(self) -> FloatArray:
         """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import is_finite_number, real_array, require_kind, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, restore
 from obsynth.numerics.suggestions import fields_suggested
@@ -93,9 +93,9 @@ class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.dt > 0.0 else "continuous"
         return (
-            f"<LinearObserver of order {self.order}, {time}: from {len(self.input_names)} inputs and "
-            f"{len(self.output_names)} outputs to {len(self.state_names)} states, {len(self.fault_names)} faults and "
-            f"{len(self.residual_names)} residuals>"
+            f"<LinearObserver of order {self.order}, {time}: from {counted(len(self.input_names), 'input')} and "
+            f"{counted(len(self.output_names), 'output')} to {counted(len(self.state_names), 'state')}, "
+            f"{counted(len(self.fault_names), 'fault')} and {counted(len(self.residual_names), 'residual')}>"
         )
 
     def __post_init__(self) -> None:
