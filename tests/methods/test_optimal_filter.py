@@ -480,7 +480,7 @@ def test_no_filter_of_finite_response_is_below_the_least(seed: int) -> None:
 @pytest.mark.parametrize(
     ("case", "options", "error", "words"),
     [
-        (LATE, {"delay": 0}, obsynth.PreconditionError, "shortest delays are 1 samples"),
+        (LATE, {"delay": 0}, obsynth.PreconditionError, r"shortest delays are 1 sample\."),
         (WANG, {"delay": [2, 0]}, obsynth.PreconditionError, "delay of 2, 0 .* shortest delays are 0, 1 samples"),
         (WANG, {"delay": {"f1": 2}}, obsynth.SpecError, "no entry for f2"),
         (WANG, {"delay": {"f1": 2, "f2": 1, "f3": 1}}, obsynth.SpecError, "f3"),

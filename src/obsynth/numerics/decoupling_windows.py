@@ -269,8 +269,8 @@ def _decoupling_window(
     if not window.estimates_faults:
         first = _first_lags(window.Th, selection)
         raise PreconditionError(
-            f"No causal filter has the exact fault map with a delay of {_listed(lags - shift)} samples: the faults' "
-            f"shortest delays are {_listed(first - shift)} samples.",
+            f"No causal filter has the exact fault map with a delay of {_in_samples(lags - shift)}: the faults' "
+            f"shortest delays are {_in_samples(first - shift)}.",
             condition="delay",
         )
     return _Window(window.observed, window.Th, stacked(a, c, *noise, window.length), window.G, window.Mf, window.length)
@@ -296,6 +296,11 @@ def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:
     newest_first = [selection @ residual[i : i + count] for i in reversed(range(0, len(residual), count))]
     missed = np.array([np.linalg.norm(part, axis=1) for part in newest_first])
     return np.asarray(np.argmax(missed <= WINDOW_IDENTITY, axis=0))
+
+
+def _in_samples(lags: NDArray[np.int64]) -> str:
+    text = _listed(lags)
+    return f"{text} {'sample' if text == '1' else 'samples'}"
 
 
 def _listed(lags: NDArray[np.int64]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, counted
 from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import WindowProblem, problem_of, samples_given
@@ -102,8 +102,8 @@ def _decisive(problem: WindowProblem, options: TestOptions, lag: int) -> Iterato
         rows = problem.tried(samples)
         if not rows:
             raise SpecError(
-                f"The plant's horizon of {problem.horizon} steps has no window of {samples} samples (k = 1 is the "
-                "first): give fewer samples, or extend the model.",
+                f"The plant's horizon of {problem.horizon} steps has no window of {counted(samples, 'sample')} (k = 1 "
+                "is the first): give fewer samples, or extend the model.",
                 path="method.options.samples",
             )
         yield from (problem.window(samples, lag=lag, row=row) for row in reversed(rows))
@@ -177,16 +177,16 @@ def _hiding_in_words(problem: WindowProblem, options: TestOptions, window: Windo
     samples = window.test_problem.samples
     if point is None and varies:
         return (
-            f"no weights of {samples} samples respond to {fault} and to nothing that is free at the rows that were "
-            "tried."
+            f"no weights of {counted(samples, 'sample')} respond to {fault} and to nothing that is free at the rows "
+            "that were tried."
         )
     if point is None:
         return (
-            f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
-            "hides it could not be "
+            f"no test on {counted(samples, 'sample')} responds to {fault} and to nothing that is free, but a time "
+            "course that hides it could not be "
             "proved: this is at the edge of double precision. Bounds of the states (state_bounds) help, even wide ones."
         )
-    where = f"the window that ends at k = {samples}" if varies else f"{samples} samples"
+    where = f"the window that ends at k = {samples}" if varies else counted(samples, "sample")
     text = f"{hidden(window, point)} (proved for {where}: every equation holds exactly)."
     if varies:
         return text

@@ -100,15 +100,15 @@ def synthesise(
     samples, table, known = chosen_samples(problem, options, beside)
     programmes = WindowProgrammes.of(problem, samples)
     per_window = f", one for each of {len(programmes.windows)} different windows" if len(programmes.windows) > 1 else ""
-    progress(f"proving the threshold on {samples} samples{per_window}")
+    progress(f"proving the threshold on {counted(samples, 'sample')}{per_window}")
     shipped = []
     for window, row in zip(programmes.windows, programmes.first, strict=True):
         optimum = known.get(row) or largest_hidden_fault(window)
         shipped.append(proved_test(window, optimum) if np.isfinite(optimum.size) else None)
     if not any(shipped[programme] for programme in programmes.of_row):
         raise SolverError(
-            f"HiGHS finds no test on {samples} samples at any row, but there is one: inconclusive. Other units may "
-            "help."
+            f"HiGHS finds no test on {counted(samples, 'sample')} at any row, but there is one: inconclusive. Other "
+            "units may help."
         )
     synthesis = _synthesis(problem, options, programmes, shipped, table, beside)
     return replace(synthesis, notes=(*synthesis.notes, *notes))
@@ -232,8 +232,9 @@ def proved_test(window: Window, optimum: Optimum) -> Shipped:
     test = repaired_multipliers(window, optimum.multipliers, refine=True)
     if test is None:
         raise SolverError(
-            f"Weights of {window.test_problem.samples} samples were found, but double precision cannot tell how far "
-            "they are from exact ones: the result is inconclusive. Fewer samples, or signals in units near one, help."
+            f"Weights of {counted(window.test_problem.samples, 'sample')} were found, but double precision cannot "
+            "tell how far they are from exact ones: the result is inconclusive. Fewer samples, or signals in units "
+            "near one, help."
         )
     test = test.with_room(rows)
     inner = window.inner
@@ -349,7 +350,7 @@ def _notes(
     elif least is not None:
         kind = disturbances_in_words(window) if isinstance(problem.plant, DescriptorSystem) else ""
         words.append(
-            f"The threshold is {upper_text(threshold)}; none with {test_problem.samples} samples is below "
+            f"The threshold is {upper_text(threshold)}; none with {counted(test_problem.samples, 'sample')} is below "
             f"{lower_text(least)} (proved{f', for {kind}' if kind else ''}). "
             + (
                 f"A fault of {upper_text(2.0 * threshold)} is certain to raise an alarm."
@@ -411,8 +412,8 @@ def _notes_of_rows(
     )
     if without:
         yield (
-            f"{without} rows have no verdict: no weights of {test_problem.samples} samples respond to the fault and to "
-            "nothing that is free."
+            f"{without} rows have no verdict: no weights of {counted(test_problem.samples, 'sample')} respond to "
+            "the fault and to nothing that is free."
         )
     if "least" not in claims:
         yield "That there is no smaller threshold is not claimed: equations before or after the window may reduce it."
