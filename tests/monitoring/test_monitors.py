@@ -491,3 +491,12 @@ def test_a_disturbance_of_the_scenario_that_begins_late_is_within_its_bounds(kin
     y1, y2 = np.array(rows).T
     run = obsynth.run_on_data(design, {"time": np.arange(500.0), "y1": y1, "y2": y2}, monitor=monitor)
     assert not run.alarms
+
+
+def test_noise_that_nobody_stated_is_not_asked_for_as_if_it_were_stated() -> None:
+    parts = {"A": [[0.9, 0.05], [0.0, 0.8]], "C": np.eye(2), "Bf": [[1.0], [0.0]], "Bd": [[0.0], [1.0]], "dt": 1.0}
+    for noise in (None, {"y1": 0.1, "y2": 0.1}):
+        design = obsynth.functional_filter(obsynth.DescriptorSystem(**parts, sensor_noise=noise))
+        with pytest.raises(obsynth.SpecError, match="Gaussian noise has no pointwise bound") as told:
+            obsynth.online_monitor(design, disturbance_bounds={"d1": 0.1}, initial_error=0.0)
+        assert ("No noise is stated, and one of deviation 1 is assumed" in str(told.value)) == (noise is None)

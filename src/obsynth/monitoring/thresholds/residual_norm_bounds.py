@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import FloatArray, largest_singular_value, sums_of_
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, state_units
+from obsynth.plants.noise import is_noise_assumed
 from obsynth.verification.over_tolerances.responses import OUTWARD
 
 #: Share of an initial error that remains after the table: it then decides nothing, and the table stays short.
@@ -62,9 +63,14 @@ def scaled_inputs(
             path="disturbance_bounds",
         )
     if model.noisy and noise_bound is None:
+        assumed = (
+            "No noise is stated, and one of deviation 1 is assumed on every sensor: state that of your sensors "
+            "(sensor_noise of the plant). "
+        )
         raise SpecError(
-            "Gaussian noise has no pointwise bound: state noise_bound (--noise-bound), the number of standard "
-            "deviations that yours never exceeds, or use a statistical threshold (chi-square or cusum).",
+            f"{assumed if is_noise_assumed(model.errors.plant.noise_names) else ''}Gaussian noise has no pointwise "
+            "bound: state noise_bound (--noise-bound), the number of standard deviations that yours never exceeds, or "
+            "use a statistical threshold (chi-square or cusum).",
             path="noise_bound",
         )
     sizes = np.where(reached, bounds, 0.0)
