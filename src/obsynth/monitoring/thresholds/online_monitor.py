@@ -383,10 +383,10 @@ def _norm_rule(
     if kind == "paper":
         table, limit = unlimited_paper(model, bounds, start, gamma)
     else:
-        names = design.linear[0].disturbance_names
-        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound, names), start, window)
+        plant = design.linear[0]
+        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound, plant), start, window)
         if model.continuous is not None:
-            inputs = scaled_inputs(model, bounds, noise_bound, names, any_stamps=True)
+            inputs = scaled_inputs(model, bounds, noise_bound, plant, any_stamps=True)
             irregular = unlimited_bound(kind, model, inputs, start, window)
     driven = None
     if kind != "paper" and model.continuous is not None and design.linear[0].nu:

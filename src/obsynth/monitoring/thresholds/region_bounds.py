@@ -110,7 +110,7 @@ def _errors_at_vertices(
         stated = list(disturbance_bounds or {})
         known = bounds_of(own, model, disturbance_bounds)
         bounds = np.where([name in stated for name in plant.disturbance_names], known, bounds)
-        inputs = scaled_inputs(model, bounds, noise_bound, plant.disturbance_names)
+        inputs = scaled_inputs(model, bounds, noise_bound, plant)
         made.append((model.A, inputs.B, model.C, inputs.D))
     if model is None:  # a plant has a vertex
         raise SpecError("The plant has no vertex.", path="plant")

@@ -269,7 +269,7 @@ def _norm_threshold(kind: str, inputs: _ResidualInputs, gamma: float | None, win
     model = inputs.model
     if kind == "paper":
         return paper_threshold(model, inputs.bounds, inputs.start, gamma)
-    scaled = scaled_inputs(model, inputs.bounds, inputs.noise_bound, inputs.design.linear[0].disturbance_names)
+    scaled = scaled_inputs(model, inputs.bounds, inputs.noise_bound, inputs.design.linear[0])
     threshold = pointwise_threshold(model, scaled, inputs.start)
     return threshold if kind == "pointwise" else window_threshold(model, scaled, inputs.start, window)
 

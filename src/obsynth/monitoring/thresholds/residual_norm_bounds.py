@@ -6,7 +6,6 @@ For records of known length, and of any length: a table for the start, and one l
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
@@ -19,7 +18,9 @@ from obsynth.numerics.arrays import FloatArray, largest_singular_value, sums_of_
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, state_units
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import is_noise_assumed
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.verification.over_tolerances.responses import OUTWARD
 
 #: Share of an initial error that remains after the table: it then decides nothing, and the table stays short.
@@ -46,7 +47,7 @@ def scaled_inputs(
     model: ResidualModel,
     bounds: FloatArray,
     noise_bound: float | None,
-    disturbances: Sequence[str],
+    plant: DescriptorSystem | PolytopicSystem,
     *,
     any_stamps: bool = False,
 ) -> ScaledInputs:
@@ -56,7 +57,7 @@ def scaled_inputs(
     sampled = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     reached = sampled if between is None else between.reached
     if np.any(lacking := reached & ~np.isfinite(bounds)):
-        names = ", ".join(disturbances[int(i)] for i in np.flatnonzero(lacking))
+        names = ", ".join(plant.disturbance_names[int(i)] for i in np.flatnonzero(lacking))
         raise SpecError(
             f"No bound is given on {names} (a Gaussian disturbance has none): give disturbance_bounds (--disturbance), "
             "or use a statistical threshold.",
@@ -68,7 +69,7 @@ def scaled_inputs(
             "(sensor_noise of the plant). "
         )
         raise SpecError(
-            f"{assumed if is_noise_assumed(model.errors.plant.noise_names) else ''}Gaussian noise has no pointwise "
+            f"{assumed if is_noise_assumed(plant.noise_names) else ''}Gaussian noise has no pointwise "
             "bound: state noise_bound (--noise-bound), the number of standard deviations that yours never exceeds, or "
             "use a statistical threshold (chi-square or cusum).",
             path="noise_bound",
