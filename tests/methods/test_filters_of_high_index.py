@@ -127,6 +127,20 @@ def test_matching_reads_outputs_late_where_known_inputs_would_be_needed_before_t
     assert 0.0 < design.least < design.gain <= 1.0 + 1e-6  # that of no filter
 
 
+def test_thresholds_of_filters_whose_errors_are_a_state_only_later_are_learned_and_run(tmp_path: Path) -> None:
+    plant = scrambled(2, 2)
+    design = obsynth.optimal_filter(plant, reference=ONE_LATE, exact=False)
+    assert "later" in design.certificate.matrices
+    rng, n = np.random.default_rng(20261201), 600
+    log = {"time": np.arange(n) * plant.dt} | {name: rng.normal(size=n) for name in plant.output_names}
+    learned = obsynth.learn_thresholds(design, log, false_alarms="1 per 100 rows")
+    shifted = log | {name: log[name] + 20.0 * (np.arange(n) >= 300) for name in plant.output_names}
+    monitor = obsynth.online_monitor(design, learned)
+    run = obsynth.run_on_data(design, shifted, monitor=monitor)
+    assert run.alarms == {"learned": 300.0 * plant.dt}
+    assert obsynth.export(design, tmp_path / "a.c", monitor=monitor)
+
+
 @pytest.mark.parametrize("later", [None, 0.0, 2.0, 0.5, np.nan])
 def test_another_number_of_samples_by_which_errors_are_later_is_refused(later: float | None, tmp_path: Path) -> None:
     design = obsynth.optimal_filter(scrambled(2, 2), reference=ONE_LATE, exact=False, norm="h2")

@@ -77,6 +77,12 @@ def error_model(design: ObserverDesign) -> ErrorModel:
     return model
 
 
+def follows_later_rows(design: ObserverDesign) -> bool:
+    """Whether the errors of a linear design have a model only some samples later than its estimates."""
+    model = method_class(design.method).error_model(design)
+    return model is not None and model.later > 0
+
+
 def methods_for(kind: PlantKind) -> tuple[str, ...]:
     """Return the ids of the methods that take plants of a kind."""
     return tuple(method for method in REGISTRY if kind in method_class(method).plants)

@@ -37,7 +37,7 @@ from obsynth.verification.error_system import ErrorModel, natural_scaling
 STEADY_BITS, MOST_STATES_IN_BITS = (212, 848, 3392), 300
 
 #: Whether the state of a larger plant settles is asked in double precision first, which nearly always tells: at 150
-#: states the digits take half a second a point.
+#: states the digits take more than a second a point.
 FEW_STATES_IN_BITS = 40
 
 #: A state that takes more than one over this samples (or times the slowest decay of the observer) to settle is none

@@ -269,7 +269,11 @@ def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
     fault_map = _claimed_map(design)
     missed, count = fault_map_missed(model, fault_map)
     delays = fault_map.delays
-    late = "as by the reference model" if delays is None else f"late by {in_words(delays)} samples"
+    late = (
+        "as by the reference model"
+        if delays is None
+        else f"late by {in_words(delays)} {'sample' if set(delays) == {1} else 'samples'}"
+    )
     return upper_bound_check(
         "fault map",
         f"faults pass exactly, {late}, whatever their time course",

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from obsynth.methods.registry import error_model
+from obsynth.methods.registry import error_model, follows_later_rows
 from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
 from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR, EarlierChanges
 from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of, ranked
@@ -348,7 +348,7 @@ def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffec
     effects: FaultEffects | None = None
     if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
         effects = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
-    elif isinstance(observer, LinearObserver):
+    elif isinstance(observer, LinearObserver) and not follows_later_rows(design):
         effects = LinearEffects(design, learned)
     return None if effects is None or effects.numbers > MOST_NUMBERS else effects
 

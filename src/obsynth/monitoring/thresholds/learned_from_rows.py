@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.methods.registry import error_model
+from obsynth.methods.registry import error_model, follows_later_rows
 from obsynth.monitoring.thresholds.cross_validation import (
     HealthyTime,
     healthy_time,
@@ -379,7 +379,8 @@ def signatures(design: ObserverDesign, places: Sequence[int], sizes: FloatArray)
     direction."""
     names = [watched_names(design)[i] for i in places]
     directions = list(np.diag(sizes))
-    if not isinstance(design.observer, LinearObserver) or expects_fault_profiles(design):
+    linear = isinstance(design.observer, LinearObserver) and not follows_later_rows(design)
+    if not linear or expects_fault_profiles(design):
         return np.array(directions), tuple(names)
     errors = error_model(design)
     observer, plant = errors.observer, errors.plant
@@ -401,7 +402,8 @@ def signatures(design: ObserverDesign, places: Sequence[int], sizes: FloatArray)
 def expects_fault_profiles(design: ObserverDesign) -> bool:
     """Whether a linear observer expects faults of a course, such as a step, which leave nothing in its residuals once
     it has followed them."""
-    return isinstance(design.observer, LinearObserver) and error_model(design).Phi is not None
+    linear = isinstance(design.observer, LinearObserver) and not follows_later_rows(design)
+    return linear and error_model(design).Phi is not None
 
 
 def varying(rows: FloatArray, first: int) -> list[int]:
