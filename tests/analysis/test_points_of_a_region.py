@@ -41,9 +41,13 @@ def test_a_mode_that_one_point_hides_is_named_with_the_point(
 def test_points_where_an_entry_vanishes_are_looked_at_along_each_parameter_and_between_vertices() -> None:
     with pytest.raises(PreconditionError, match=r"at v = 0, w = 0\.5"):
         obsynth.descriptor_kalman(hidden("v", {"v": [-1, 2], "w": [0, 1]}, "2 + w"), Q=1.0, R=1.0)
-    vertices = [DescriptorSystem(None, [[0.5, v], [0, 2]], C=[[1, 0]], dt=1.0) for v in (-1.0, 1.0, 4.0)]
-    with pytest.raises(PreconditionError, match=r"at weight1 = 0\.8, weight3 = 0\.2"):
-        obsynth.descriptor_kalman(PolytopicSystem(vertices), Q=1.0, R=1.0)
+    for entries, where in (
+        ((-1.0, 1.0, 4.0), r"at weight1 = 0\.5, weight2 = 0\.5"),
+        ((-1.0, 4.0, 1.0), r"at weight1 = 0\.8, weight2 = 0\.2"),
+    ):
+        vertices = [DescriptorSystem(None, [[0.5, v], [0, 2]], C=[[1, 0]], dt=1.0) for v in entries]
+        with pytest.raises(PreconditionError, match=where):
+            obsynth.descriptor_kalman(PolytopicSystem(vertices), Q=1.0, R=1.0)
     # Without a change of sign, and where the hidden mode decays, there are filters.
     assert obsynth.descriptor_kalman(hidden("v", {"v": [1, 2]}), Q=1.0, R=1.0).report.passed
     assert obsynth.descriptor_kalman(hidden("v", {"v": [-1, 2]}, 0.5), Q=1.0, R=1.0).report.passed
