@@ -36,9 +36,9 @@ from obsynth.verification.error_system import ErrorModel, natural_scaling
 #: Digits, in bits, that are tried after double precision; of more states of plant or observer none are.
 STEADY_BITS, MOST_STATES_IN_BITS = (212, 848, 3392), 300
 
-#: Whether the state of a larger plant settles is asked in double precision first, which nearly always tells: at 150
-#: states the digits take more than a second a point.
-FEW_STATES_IN_BITS = 40
+#: Whether the state of a plant settles is told in the last of these digits, in bits.  Of a plant of more than a few
+#: states it is asked in fewer first (none: double precision), which nearly always tell, at a tenth of the time.
+FEW_STATES_IN_BITS, FIRST_BITS, LAST_BITS = 40, (0, STEADY_BITS[0]), STEADY_BITS[1]
 
 #: A state that takes more than one over this samples (or times the slowest decay of the observer) to settle is none
 #: that settles: it differs from the one for faults that grow at this rate.
@@ -153,11 +153,12 @@ def has_steady_state(plant: DescriptorSystem, observer: LinearObserver, rate: fl
         slowest = float(np.min(np.abs(poles_of(observer).real)))
     points = steady_point(plant), steady_point(plant) + rate * slowest
     if FEW_STATES_IN_BITS < plant.nx <= MOST_STATES_IN_BITS:
-        alike = _certainly_alike(plant, *(_state_at(plant, point, Ball) for point in points))
-        if alike is not None:
-            return alike
-    kind: type[Any] = ExtendedBall if plant.nx <= MOST_STATES_IN_BITS else Ball
-    held, growing = (_state_at(plant, point, kind) for point in points)
+        for bits in FIRST_BITS:
+            alike = _certainly_alike(plant, *(_state_at(plant, point, bits) for point in points))
+            if alike is not None:
+                return alike
+    bits = LAST_BITS if plant.nx <= MOST_STATES_IN_BITS else 0
+    held, growing = (_state_at(plant, point, bits) for point in points)
     if held is None or growing is None:
         return False
     with np.errstate(all="ignore"):
@@ -205,9 +206,12 @@ def _unstable(poles: ComplexArray, dt: float) -> list[bool]:
     return [bool(np.isfinite(pole)) and is_outside(complex(pole), dt) for pole in poles]
 
 
-def _state_at(plant: DescriptorSystem, point: float, kind: type[Any]) -> Ball | None:
-    """Return the enclosed state under faults that grow as ``lambda^k`` (e^(lambda t)), one in the beginning."""
-    with flint.ctx.workprec(STEADY_BITS[1]):
+def _state_at(plant: DescriptorSystem, point: float, bits: int) -> Ball | None:
+    """Return the enclosed state under faults that grow as ``lambda^k`` (e^(lambda t)), one in the beginning.
+
+    ``bits``: digits of the arithmetic, none of them for double precision."""
+    kind: type[Any] = ExtendedBall if bits else Ball
+    with flint.ctx.workprec(bits or STEADY_BITS[0]):
         pencil = kind.exact(plant.E).scaled(point) - kind.exact(plant.A)
         solution = enclosed_solution(pencil, kind.exact(plant.Bf))
         if solution is None:
