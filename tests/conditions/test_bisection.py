@@ -83,10 +83,10 @@ def test_an_error_of_the_solver_is_unknown_and_not_infeasible(monkeypatch: pytes
     paper = obsynth.conditions.wang2015(PLANT, gamma=10.0)
     real = type(paper).solve
 
-    def failing(self, solver, settings) -> None:
+    def failing(self, *, solver, settings) -> None:
         if 4.0 < self.parameters["gamma_squared"].value < 30.0:
             raise SolverError("failed")
-        real(self, solver, settings)
+        real(self, solver=solver, settings=settings)
 
     monkeypatch.setattr(type(paper), "solve", failing)
     found = paper.bisect("gamma_squared", 100.0, 0.0, tolerance=0.5)

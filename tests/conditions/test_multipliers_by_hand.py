@@ -12,7 +12,7 @@ from obsynth.conditions.problem import Conditions
 
 
 def _solved(problem: Conditions, name: str) -> float:
-    problem.solve("CLARABEL", {})
+    problem.solve()
     return float(problem.variables[name].value)
 
 

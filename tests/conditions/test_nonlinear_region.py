@@ -17,7 +17,7 @@ _NOISE = {"l1": 0.1, "l2": 0.1, "leak": 0.1}
 
 def _least(goal: str, multiplier: str) -> float:
     found = nonlinear_region(tanks(), REGION, sample_time=2.0, noise=_NOISE, goal=goal, multiplier=multiplier)
-    found.solve("CLARABEL", {})
+    found.solve()
     assert found.problem.status in ("optimal", "optimal_inaccurate")
     return float(np.sqrt(found.problem.value))
 
@@ -43,7 +43,7 @@ def test_a_spring_ends_where_it_must() -> None:
             nominal = ErrorPolytope([[[0, 1], [-(1 + b) / 2, -1]]], np.zeros((0, 2)), dt=0.0)
             errors = SlopedErrors(nominal, np.array([[0], [(1 - b) / 2]]), np.zeros((0, 1)), np.array([[1.0, 0]]))
             found = slope_inequality(errors, goal="decay", decay=0.0, multiplier=kind)
-            found.solve("CLARABEL", {})
+            found.solve()
             assert (float(found.variables["room"].value) > 1e-6) is holds
 
 

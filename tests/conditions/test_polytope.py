@@ -29,7 +29,7 @@ def _spring(b: float) -> ErrorPolytope:
 
 def _least(errors: ErrorPolytope, name: str = "gamma_squared", **options: Any) -> float:
     found = vertex_inequalities(errors, **options)
-    found.solve("CLARABEL", {})
+    found.solve()
     return float(found.variables[name].value)
 
 
@@ -83,7 +83,7 @@ def _daafouz(a: float) -> ErrorPolytope:
 def test_a_matrix_at_each_vertex_proves_more(a: float, lyapunov: str, stable: bool) -> None:
     # Frozen, the plant is stable to 0.46200 (Daafouz, Bernussou 2001: 0.4619 by P at each vertex).
     found = vertex_inequalities(_daafouz(a), goal="decay", decay=1.0, lyapunov=lyapunov, gains=[np.zeros((4, 0))])
-    found.solve("CLARABEL", {})
+    found.solve()
     witness, gains = witness_of(_daafouz(a), found)
     assert prove_decay(_daafouz(a).closed(gains), witness, 1.0, discrete=True).proved is stable
 
@@ -136,7 +136,7 @@ def test_measured_scheduling_is_not_estimated_scheduling() -> None:
     for ends, decays in (((-2.0, -0.1), True), ((-2.0, 1.8), False)):
         errors = ErrorPolytope([[[a]] for a in ends], np.zeros((0, 1)), dt=0.0)
         found = vertex_inequalities(errors, goal="decay", decay=0.05, gains=[np.zeros((1, 0))])
-        found.solve("CLARABEL", {})
+        found.solve()
         assert (
             prove_decay(errors.closed([np.zeros((1, 0))]), witness_of(errors, found)[0], 0.05, discrete=False).proved
             is decays

@@ -33,16 +33,16 @@ def matrices(gains: dict[str, FloatArray], degree: int) -> list[FloatArray]:
 def solved_gain(errors: ErrorPolytope, rate: float, degree: int, pieces: int) -> tuple[float, list[FloatArray]]:
     """Return the least gain, and P at a thousandth above it."""
     found = rated_inequalities(errors, rate, degree=degree, pieces=pieces, gains=NONE)
-    found.solve("CLARABEL", {})
+    found.solve()
     least = float(found.variables["gamma_squared"].value) ** 0.5
     found = rated_inequalities(errors, rate, degree=degree, pieces=pieces, gains=NONE, level=1.001 * least)
-    found.solve("CLARABEL", {})
+    found.solve()
     return least, matrices(found.gains(), degree)
 
 
 def is_stable(b: float, rate: float, degree: int = 2, pieces: int = 4) -> bool:
     found = rated_inequalities(spring(b), rate, goal="decay", degree=degree, pieces=pieces, gains=NONE)
-    found.solve("CLARABEL", {})
+    found.solve()
     P = matrices(found.gains(), degree)
     return prove_rated_decay(spring(b).closed(NONE), P, rate, 0.0).proved
 
@@ -128,9 +128,9 @@ def test_a_gain_that_changes_buys_more_where_the_parameter_is_slow() -> None:
         [[[0, 1], [-1, -0.1]], [[0, 1], [-6, -0.1]]], [[1.0, 0]], B=[[0.0, 0], [1, 0]], D=[[0.0, 1]], dt=0.0
     )
     any_course = vertex_inequalities(errors)
-    any_course.solve("CLARABEL", {})
+    any_course.solve()
     slow = rated_inequalities(errors, 0.1, degree=1, pieces=1)
-    slow.solve("CLARABEL", {})
+    slow.solve()
     level = 1.001 * float(slow.variables["gamma_squared"].value) ** 0.5
     assert level < float(any_course.variables["gamma_squared"].value) ** 0.5
     assert slow.gains()["L[1]"].shape == (2, 1)

@@ -131,7 +131,7 @@ def test_delta_is_chosen_well_inside_of_the_region(rate: float) -> None:
 def test_a_solver_that_ends_without_an_answer_is_no_proof_that_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     found = SimpleNamespace(
         source="the inequality", constraints={"own": None}, problem=SimpleNamespace(status="infeasible"),
-        solve=lambda *_: None,
+        solve=lambda **_: None,
     )  # fmt: skip
     asked = SimpleNamespace(solver="CLARABEL", solver_options=None)
     with pytest.raises(obsynth.SolverError, match="'own'") as told:

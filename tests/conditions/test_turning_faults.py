@@ -26,7 +26,7 @@ def turning_plant(**changes: Any) -> PolytopicSystem:
 def test_a_fault_that_turns_has_no_effect_on_the_corrected_error() -> None:
     plant = turning_plant()
     found = turning_faults(plant)
-    found.solve("CLARABEL", {})
+    found.solve()
     assert found.variables["room"].value > 1e-8
     gains = found.gains()
     T, N, C = gains["T"], gains["N"], np.eye(3, 4)
@@ -48,7 +48,7 @@ def test_a_fault_that_turns_has_no_effect_on_the_corrected_error() -> None:
 def test_errors_decay_as_is_proved_and_no_fault_leaks() -> None:
     plant = turning_plant()
     found = turning_faults(plant)
-    found.solve("CLARABEL", {})
+    found.solve()
     made = turning_errors(plant, found.gains())
     decay, witness, none = best_decay(made.errors, gains=[np.zeros((4, 0))])
     assert decay < 1.0

@@ -18,7 +18,16 @@ PUBLIC |= {f"obsynth.conditions.{name}": getattr(obsynth.conditions, name) for n
 PUBLIC |= {f"obsynth.plotting.{name}": getattr(obsynth.plotting, name) for name in obsynth.plotting.__all__}
 PUBLIC |= {f"obsynth.types.{name}": getattr(obsynth.types, name) for name in obsynth.types.__all__}
 FUNCTIONS = {name: item for name, item in PUBLIC.items() if inspect.isfunction(item)}
-WITH_EXAMPLES = {name: item for name, item in PUBLIC.items() if ">>>" in (inspect.getdoc(item) or "")}
+
+
+def examples_of(item: object, name: str) -> list[doctest.DocTest]:
+    """Return the examples of something public, and of the methods of a class."""
+    names = dict(vars(inspect.getmodule(inspect.unwrap(item)) or obsynth))  # type: ignore[arg-type]
+    parts = doctest.DocTestFinder().find(item, name, globs=names, module=False)  # type: ignore[arg-type]
+    return [part for part in parts if part.examples]
+
+
+WITH_EXAMPLES = {name: item for name, item in PUBLIC.items() if examples_of(item, name)}
 
 
 def test_every_public_function_has_an_example() -> None:
@@ -37,12 +46,9 @@ def test_the_example_prints_what_it_says(name: str, monkeypatch: pytest.MonkeyPa
     # Where paths of examples begin: a clone.
     monkeypatch.chdir(ROOT)
     with mpl.rc_context({"backend": "Agg"}):
-        item = WITH_EXAMPLES[name]
-        names = dict(vars(inspect.getmodule(inspect.unwrap(item)) or obsynth))
-        (example,) = doctest.DocTestFinder(recurse=False).find(item, name, globs=names, module=False)
-        assert example.examples
         told: list[str] = []
         runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
-        runner.run(example, out=told.append)
+        for example in examples_of(WITH_EXAMPLES[name], name):
+            runner.run(example, out=told.append)
         plt.close("all")
     assert "".join(told) == ""

@@ -38,7 +38,7 @@ def test_the_spring_misses_less_than_the_bound_and_its_decay_is_proved() -> None
     assert missed == pytest.approx(0.00016, abs=1e-5)
     assert sampled.ball == pytest.approx(0.0053, abs=5e-5)
     found = vertex_inequalities(sampled, goal="decay", decay=0.8, gain_limit=1e3)
-    found.solve("CLARABEL", {})
+    found.solve()
     witness, gains = witness_of(sampled, found)
     closed = sampled.closed(gains)
     assert prove_decay(closed, witness, 0.8, discrete=True, ball=sampled.ball).proved

@@ -117,7 +117,7 @@ def vertex_inequalities(
     --------
     >>> scalar = ErrorPolytope([[[a]] for a in (0.5, 0.9, 1.2)], [[1.0]], B=[[1.0, 0.0]], D=[[0.0, 1.0]], dt=1.0)
     >>> conditions = vertex_inequalities(scalar)
-    >>> conditions.solve("CLARABEL", {})
+    >>> _ = conditions.solve()
     >>> round(float(conditions.variables["gamma_squared"].value) ** 0.5, 5)
     1.56205
     """

@@ -161,31 +161,58 @@ class Conditions:
                     "digits where it has been solved."
                 )
 
-    def solve(self, solver: str, settings: Mapping[str, Any]) -> None:
-        """Solve the problem; whatever the solver does ends in values, in a status, or in a `SolverError`.
+    @arguments_checked
+    def solve(self, *, solver: str | None = None, settings: Mapping[str, Any] | None = None) -> float:
+        """Solve the problem, as ``problem.solve()`` does; what goes wrong in a solver is a `SolverError`.
 
         Parameters
         ----------
-        solver : str
-            One of ``cvxpy.installed_solvers()``.
-        settings : mapping
-            Its settings by its own names.
+        solver : str, optional
+            One of ``cvxpy.installed_solvers()``.  By default Clarabel, and cvxpy's own choice where that has no answer.
+        settings : mapping, optional
+            Settings of the solver by its own names.
+
+        Returns
+        -------
+        float
+            The least value of the objective: 0 where there is none, infinite where the solver says that there is no
+            solution.  ``problem.status`` says what the solver found.
 
         Raises
         ------
+        SpecError
+            No such solver is installed.
         SolverError
             The solver failed.
+
+        Examples
+        --------
+        >>> import obsynth
+        >>> plant = obsynth.DescriptorSystem(
+        ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0.1], [1]], dt=1.0
+        ... )
+        >>> paper = obsynth.conditions.wang2015(plant)
+        >>> gamma_squared = paper.solve()
+        >>> paper.problem.status
+        'optimal'
         """
+        if solver is not None and solver not in cp.installed_solvers():
+            raise SpecError(
+                f"There is no solver {solver!r}; {there_are(solver, cp.installed_solvers())}", path="solver"
+            )
+        named = {} if solver is None else {"solver": solver}
         try:
             with warnings.catch_warnings(action="ignore"):
                 # The status says the same.
-                self.problem.solve(solver=solver, **settings)
+                self.problem.solve(**named, **(settings or {}))
         except (KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:  # Rust panics, and memory that ran out inside the solver
             raise SolverError(
-                f"{solver} failed while solving {self.source} ({error}): the result is inconclusive."
+                f"{solver or 'The solver'} failed while solving {self.source} ({error}): the result is inconclusive."
             ) from error
+        value = self.problem.value
+        return np.nan if value is None else float(value)
 
     @arguments_checked
     def bisect(
@@ -239,8 +266,8 @@ class Conditions:
         ... )
         >>> paper = obsynth.conditions.wang2015(plant, gamma=10.0)
         >>> found = paper.bisect("gamma_squared", 100.0, 0.0)
-        >>> found.infeasible < found.feasible, found.unknown
-        (True, ())
+        >>> print(f"least gamma {found.feasible**0.5:.2f}")
+        least gamma 0.10
         """
         if parameter not in self.parameters:
             listed = (
@@ -279,7 +306,7 @@ class Conditions:
         """Return what a solver finds at a level; whatever is neither a solution nor a plain no is unknown."""
         self.parameters[parameter].value = level
         try:
-            self.solve(solver, settings)
+            self.solve(solver=solver, settings=settings)
         except SolverError:
             return "unknown"
         if self.problem.status == "infeasible":

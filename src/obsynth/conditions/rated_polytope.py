@@ -96,7 +96,7 @@ def rated_inequalities(
     ...     [-np.eye(2)] * 2, np.zeros((0, 2)), B=[[[1.0], [-1]], [[1.0], [1]]], Cz=[[[-1.0, -1]], [[1.0, -1]]], dt=0.0
     ... )
     >>> conditions = rated_inequalities(errors, 0.1, degree=1, pieces=4)
-    >>> conditions.solve("CLARABEL", {})
+    >>> _ = conditions.solve()
     >>> 0.2 < float(conditions.variables["gamma_squared"].value) ** 0.5 < 0.8
     True
     """

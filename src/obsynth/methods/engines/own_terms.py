@@ -243,7 +243,7 @@ def _solved(problem: Conditions, method: Any) -> dict[str, Any]:
         failure = None
         record: dict[str, Any] = {"what": problem.source, "solver": str(name), "settings": settings}
         try:
-            problem.solve(name, settings)
+            problem.solve(solver=name, settings=settings)
             break
         except SolverError as error:
             error.record, failure = {**record, "status": "crashed"}, error

@@ -497,7 +497,7 @@ def has_numbers(problem: Any, solver: str, settings: Mapping[str, Any] | None, r
     """Solve, and return whether there are numbers to look at."""
     record = {"what": problem.source, "solver": str(solver), "settings": dict(settings or {})}
     try:
-        problem.solve(solver, settings or {})
+        problem.solve(solver=solver, settings=settings)
     except SolverError:
         runs.append({**record, "status": "crashed"})
         return False
