@@ -3,23 +3,33 @@
 The papers' inequalities
     conditions: each as a cvxpy problem, in the letters of its paper, to read, change and solve.
 Plants
-    DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_casadi, from_control,
-    from_fmu, from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by
-    discretise, eliminate_algebraic_states, with_noise.
+    DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem, DAEModel; from a spec: load_spec, Spec; from other
+    tools: from_andes, from_casadi, from_control, from_fmu, from_matlab, from_modelica, from_pandas, from_scipy,
+    from_sympy; to other tools: uncertain_system.  Changed by absorb_delays, discretise, eliminate_algebraic_states,
+    linearise, with_functionals, with_noise.
 What is possible
-    check, analyse_structure, diagnose, identifiability.
+    check, analyse_structure, diagnose, identifiability; decouple; fault_model.
 Designs
-    design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
-    adaptive_observer, dae_adaptive_observer, extended_kalman, region_observer, guaranteed_test; verify, load;
-    optimal_filter: the least gain possible.
+    design, and one function for each method: optimal_filter (the least gain possible), fault_estimation_filter,
+    pd_observer, ui_pi_observer, descriptor_kalman, steady_state_filter, functional_filter, detection_filter,
+    adaptive_observer, dae_adaptive_observer, extended_kalman, region_observer, guaranteed_test.  design_from_gains,
+    apply_adaptation_gain, sample_observer, fault_response; verify, load, export, html_report.
+Comparing and choosing
+    compare, sweep, sensor_sets, region_trade_off; robustness, tolerance_study; verify_certificate.
 On data
-    run_on_data, smooth, learn_thresholds, online_monitor, plotting.plot_data, html_report, export.
+    run_on_data, smooth, validate, calibrate, validity; learn_thresholds, load_thresholds, online_monitor; prove_alarm,
+    verify_alarm.
 In simulation
-    Scenario, simulate, monitor, evaluate, decide; plotting.
+    Scenario of Step, Ramp, Drift, Sine, Stuck, Intermittent, LostEffectiveness, TimeTable, with Gaussian or Uniform
+    noise; simulate, simulate_dae, simulate_time_varying, run_batch, run_fleet, evaluate; monitor, decide.
+Pictures
+    plotting: plot_data, plot_faults, plot_gains, plot_trade_off and others.
 What is wrong
     SpecError, PreconditionError, InfeasibleError, SolverError, VerificationError, all of them ObsynthError.
 Types
-    Of what functions return, for annotations: ``obsynth.types``.
+    What functions return: ObserverDesign, with a LinearObserver, RecursiveObserver or DAEObserver and a
+    VerificationReport; OptimalFilter, GuaranteedTest, Comparison, Certificate, FaultModel, Adaptation,
+    ParameterMonitor.  Others, for annotations: ``obsynth.types``.
 """
 
 from __future__ import annotations
