@@ -40,7 +40,7 @@ def row(n: int, count: int) -> tuple[float, float, float]:
     """Return seconds of the least gain, of a design whose claim is proved, and of the proof of one vertex."""
     errors = random_errors(n, count)
     start = time.process_time()
-    vertex_inequalities(errors).solve("CLARABEL", {})
+    vertex_inequalities(errors).solve()
     solved = time.process_time()
     made = certified(errors)
     designed = time.process_time()

@@ -43,7 +43,7 @@ def case(seed: int) -> Outcome:
     found = obsynth.conditions.wang2015(plant, coordinates="balanced", margin=0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found.solve("CLARABEL", {})
+        found.solve()
     printed = float(np.sqrt(max(float(found.variables["gamma_squared"].value), 0.0)))
     if printed < least.gain - SAME * size:
         wrong.append(f"printed {printed:.9g} below {least.gain:.9g}")

@@ -24,7 +24,7 @@ def test_the_least_value_is_returned_and_is_that_of_the_problem(plant: obsynth.D
 def test_no_solution_is_an_infinite_value(plant: obsynth.DescriptorSystem) -> None:
     paper = wang2015(plant, gamma=1e-3)
     assert paper.solve() == np.inf
-    assert paper.problem.status == "infeasible"
+    assert paper.problem.status.startswith("infeasible")
 
 
 def test_a_solver_that_is_not_there_is_named_with_those_that_are(plant: obsynth.DescriptorSystem) -> None:

@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 from scipy import stats
@@ -500,3 +501,42 @@ def test_noise_that_nobody_stated_is_not_asked_for_as_if_it_were_stated() -> Non
         with pytest.raises(obsynth.SpecError, match="Gaussian noise has no pointwise bound") as told:
             obsynth.online_monitor(design, disturbance_bounds={"d1": 0.1}, initial_error=0.0)
         assert ("No noise is stated, and one of deviation 1 is assumed" in str(told.value)) == (noise is None)
+
+
+def _tank(method: str) -> obsynth.ObserverDesign:
+    """A design that holds a model of the fault, which its residual does not see: a leak of two tanks."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.95, 0.03], [0.03, 0.94]],
+        C=np.eye(2),
+        Bf=[[1.0], [0.0]],
+        Bw=np.diag([0.01, 0.01]),
+        Dw=np.zeros((2, 2)),
+        sensor_noise={"y1": 0.1, "y2": 0.1},
+        dt=1.0,
+    )
+    return obsynth.design(plant, method)
+
+
+@pytest.mark.parametrize("method", ["functional-filter", "ui-pi-observer"])
+@pytest.mark.parametrize("kind", ["chi-square", "cusum"])
+def test_a_fault_that_stays_is_seen_while_it_stays(method: str, kind: str) -> None:
+    """The residual shows its beginning and its end at most; what is watched is the estimate."""
+    design = _tank(method)
+    deviation = float(
+        np.std(obsynth.simulate(design, obsynth.Scenario(horizon=2000, noise=1, seed=3)).estimates.faults[200:])
+    )
+    fault = obsynth.Step(size=10.0 * deviation, start=500, end=900)
+    for seed in range(3):
+        scenario = obsynth.Scenario(horizon=1000, noise=1, seed=seed, faults={"f1": fault})
+        record = obsynth.simulate(design, scenario)
+        watched = obsynth.monitor(design, scenario, kind)
+        assert "of the fault estimates" in watched.statement
+        values = watched.watch(record.estimates).values
+        passed = values > watched.threshold
+        assert not passed[:500].any()
+        assert passed[600:900].mean() > 0.8
+        online = obsynth.online_monitor(design, kind, scenario=scenario)
+        table = pd.DataFrame(record.outputs, columns=list(design.plant.output_names)).assign(time=record.time)
+        alarms = obsynth.run_on_data(design, table, monitor=online).table["alarm"].to_numpy().astype(bool)
+        assert not alarms[:500].any()
+        assert alarms[600:900].mean() > 0.8

@@ -326,8 +326,7 @@ def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs, fault_names: t
         k = begin + int(np.argmax(passed[begin:, run]))
         end = min(k + watched.isolation_delay, len(passed) - 1) + 1
         if watched.groups:
-            rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
-            group = watched.groups[watched.isolated(runs.rows[:, run, rows], k)]
+            group = watched.groups[watched.isolated(runs.rows[:, run, watched.watched.rows(observer)], k)]
             acted = np.any(runs.faults[:end, run] != 0.0, axis=0)
             wrong = not acted[[fault_names.index(name) for name in group]].any()
         else:

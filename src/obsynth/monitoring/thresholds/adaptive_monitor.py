@@ -12,9 +12,10 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.tracking import structure_of, tracking_of
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
 from obsynth.monitoring.thresholds.monitor import BOUNDS_AND_HELD_INPUTS, HELD, Rule
-from obsynth.monitoring.thresholds.residual_model import noisy_plant, watches_estimates
+from obsynth.monitoring.thresholds.residual_model import noisy_plant
 from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.monitoring.thresholds.sampled_errors import SAMPLING, sampled_problem
+from obsynth.monitoring.thresholds.watched_rows import estimates_modelled_faults
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import shown
@@ -92,7 +93,7 @@ def adaptive_plan(
             same,
             reason,
             begin.norm is None,
-            watches_estimates(design) or not observer.residual_names,
+            estimates_modelled_faults(design) or not observer.residual_names,
             affine.box.names,
             observer.fault_names,
             observer.residual_names,
@@ -133,7 +134,7 @@ def _sampled_plan(
             same=False,
             reason=why,
             start_beyond_nominal=True,
-            estimates=watches_estimates(design),
+            estimates=estimates_modelled_faults(design),
             names=(*problem.affine.box.names, SAMPLING),
             fault_names=observer.fault_names,
             residual_names=observer.residual_names,

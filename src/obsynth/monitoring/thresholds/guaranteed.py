@@ -20,6 +20,7 @@ from obsynth.methods.guaranteed_test.windows import disturbances_in_words
 from obsynth.monitoring.thresholds.adaptive_monitor import over_box
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.rules import NormRule
+from obsynth.monitoring.thresholds.watched_rows import Watched
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.outward import lower_text, upper_text
 from obsynth.observers.linear.observer import LinearObserver
@@ -162,7 +163,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, option
         horizon=len(threshold),
         dt=dt,
         floor=0.0 if is_bank(test) else floors[0],
-        watches_estimates=bool(observer.fault_names),
+        watched=Watched.ESTIMATES if observer.fault_names else Watched.RESIDUALS,
         groups=test.groups,
     )
 

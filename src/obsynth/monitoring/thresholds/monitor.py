@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.alarm_ranking import Ranking
+from obsynth.monitoring.thresholds.watched_rows import Watched
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.detection import Detection
@@ -55,8 +56,11 @@ BOUNDS_AND_HELD_INPUTS = BOUNDS_BETWEEN_SAMPLES + "; known inputs are held betwe
 #: The other assumptions of every bound that is never passed.
 ASSUMED = "; the plant starts from zero, known inputs are held or straight lines between samples"
 
-#: Where the residual is made not to see the faults that are modelled.
-OF_ESTIMATES = "the norm of the fault estimates, as modelled faults have no effect on the residual: "
+#: How a statement begins, by what is watched: the residual may be made not to see the faults that are modelled.
+WHAT_IS_WATCHED: Mapping[Watched, str] = {
+    Watched.RESIDUALS: "",
+    Watched.ESTIMATES: "of the fault estimates, as modelled faults have no lasting effect on the residual: ",
+}
 
 #: What a recursive or nonlinear observer learnt from a sample: a row of it.
 Evidence: TypeAlias = RawEstimate | DAERow
@@ -68,10 +72,9 @@ RuleState: TypeAlias = Any
 
 
 def statement_of(
-    kind: str, model: ResidualModel, assumed: Assumptions | None, *, estimates: bool, **numbers: float
+    kind: str, model: ResidualModel, assumed: Assumptions | None, *, watched: Watched, **numbers: float
 ) -> str:
-    """Return what a threshold promises and what it rests on; ``estimates``: of the fault estimates instead of the
-    residual; ``numbers``: window, false_alarms, change and dt."""
+    """Return what a threshold promises and what it rests on; ``numbers``: window, false_alarms, change and dt."""
     ending = ""
     if kind in ("pointwise", "window"):
         # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
@@ -82,7 +85,7 @@ def statement_of(
     words = (STATEMENTS[kind] + "{kept}" + ending).format(
         kept=f", with {assumptions}" if assumptions else "", **words_of_numbers
     )
-    return (OF_ESTIMATES if estimates else "") + words
+    return WHAT_IS_WATCHED[watched] + words
 
 
 class LinearSample(NamedTuple):
@@ -214,8 +217,8 @@ class Monitor:
         What rounding may add to the statistic.
     isolation_delay : int, optional
         Samples from the alarm to the comparison.
-    watches_estimates : bool, optional
-        Whether the fault estimates stand in place of the residual, which does not see modelled faults.
+    watched : Watched, optional
+        What it watches: the residuals, or fault estimates where the residuals do not see modelled faults.
     groups : tuple of tuple of str, optional
         By row that is watched: an alarm of it proves that one of these faults is there.
 
@@ -241,7 +244,7 @@ class Monitor:
     dt: float = math.nan
     floor: float = 0.0
     isolation_delay: int = 0
-    watches_estimates: bool = False
+    watched: Watched = Watched.RESIDUALS
     groups: tuple[tuple[str, ...], ...] = ()
 
     def __repr__(self) -> str:
@@ -407,8 +410,7 @@ class Monitor:
             passes first after that, need be right.
         """
         observer: Any = runs.observer
-        rows = observer.fault_rows if self.watches_estimates else observer.residual_rows
-        norm = self.statistic(runs.rows[:, :, rows])
+        norm = self.statistic(runs.rows[:, :, self.watched.rows(observer)])
         return self.rule.passed_in(runs, norm, self.nominal_threshold + self.floor, onset)
 
     def isolated(self, faults: FloatArray, k: int) -> int:
@@ -443,7 +445,7 @@ class Monitor:
                 "or obsynth.online_monitor with obsynth.run_on_data.",
                 path="monitor",
             )
-        watched = estimates.faults if self.watches_estimates else estimates.residuals
+        watched = self.watched.of(estimates)
         values = self.statistic(watched[:, None])[:, 0]
         hits = np.flatnonzero(values > self.threshold + self.floor)
         k = int(hits[0]) if hits.size else None

@@ -27,7 +27,6 @@ from obsynth.monitoring.thresholds.residual_model import (
     ResidualModel,
     largest_disturbances,
     residual_model,
-    watches_estimates,
 )
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of, require_no_region
 from obsynth.monitoring.thresholds.residual_norm_bounds import (
@@ -37,6 +36,7 @@ from obsynth.monitoring.thresholds.residual_norm_bounds import (
     unlimited_paper,
 )
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
+from obsynth.monitoring.thresholds.watched_rows import Watched, watched_by
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -215,8 +215,8 @@ def online_monitor(
     if is_guaranteed(design):
         return data_monitor(design, kind, options)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
-    estimates = watches_estimates(design) and kind in ("pointwise", "window")
-    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
+    watched = watched_by(design, kind)
+    model, dt = _endless_model(design, scenario, window, sample_time, watched=watched)
     model = model.held() if disturbance == "held" else model
     require_noise(noise_bound, noisy=model.noisy)
     bounds = _known_bounds(design, model, disturbance_bounds, scenario)
@@ -231,12 +231,13 @@ def online_monitor(
             residuals=len(design.linear[1].residual_names),
             fault_names=design.linear[1].fault_names,
             fault_scales=model.fault_scales(),
+            watched=watched,
         )
 
     rule: Rule
     if limited or kind == "paper":
         start = 0.0 if initial_error is None else float(initial_error)
-        norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
+        norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, watched)
         if adaptive:
             rule, promise = over_box(
                 noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt, disturbance=disturbance
@@ -248,11 +249,20 @@ def online_monitor(
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
         ending = _ending(kind, model, norm, limit, gaps, dt, from_the_first=initial_error is not None)
     else:
-        rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
+        rule = _whitened(
+            kind,
+            model,
+            bounds if scenario is None else None,
+            watched,
+            window=window,
+            change=change,
+            false_alarms=false_alarms,
+            dt=dt,
+        )
         ending = ANY_LENGTH + (_JITTERING if model.continuous is not None else "")
     numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
-    return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)
+    return made(statement_of(kind, model, assumed, watched=watched, **numbers) + ending + NO_TOLERANCE, rule)
 
 
 def _over_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
@@ -297,7 +307,7 @@ def _over_sampled_region(design: ObserverDesign, options: Mapping[str, Any]) -> 
     assumed = Assumptions(plant.vertices[0], bounds, noise_bound or 0.0, initial_error=start)
     return Monitor(
         "pointwise",
-        statement_of("pointwise", model, assumed, estimates=False)
+        statement_of("pointwise", model, assumed, watched=Watched.RESIDUALS)
         + f", for every course of {', '.join(plant.scheduling.names)} in the region"
         + (_AFTER_OUT if start is None else _FROM_THE_FIRST_INSIDE)
         + (NOISE_ASSUMED if is_noise_assumed(plant.vertices[0].noise_names) else "")
@@ -376,7 +386,7 @@ def _norm_rule(
     gamma: float | None,
     window: int,
     dt: float,
-    estimates: bool,
+    watched: Watched,
 ) -> tuple[NormRule, float]:
     """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
     irregular = None
@@ -397,7 +407,7 @@ def _norm_rule(
         window=window if kind == "window" else 1,
         dt=dt,
         irregular=irregular,
-        watched=design.linear[1].fault_rows if estimates else None,
+        watched=None if watched is Watched.RESIDUALS else watched.rows(design.linear[1]),
         driven=driven,
     )
     return rule, limit
@@ -445,7 +455,7 @@ def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str
 
 
 def _endless_model(
-    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, estimates: bool
+    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, watched: Watched
 ) -> tuple[ResidualModel, float]:
     """Return a model with as many samples as an error at the start needs to decay, and their distance."""
     plant, observer = design.linear
@@ -470,7 +480,7 @@ def _endless_model(
         observer_state=None,
         stabilise=False,
     )
-    model = residual_model(design, expected, endless=True, estimates=estimates)
+    model = residual_model(design, expected, endless=True, watched=watched)
     if scenario is None:
         return model, dt
     return replace(model, bounds=largest_disturbances(scenario, plant.disturbance_names, dt)), dt
@@ -480,6 +490,8 @@ def _whitened(
     kind: str,
     model: ResidualModel,
     unknown: FloatArray | None,
+    watched: Watched,
+    *,
     window: int,
     change: float,
     false_alarms: float,
@@ -492,7 +504,7 @@ def _whitened(
             "or use pointwise with disturbance bounds.",
             path="disturbances",
         )
-    whitener, white = whitened(kind, model, window)
+    whitener, white = whitened(kind, model, window, watched)
     return WhitenedRule(
         whitener,
         steady_mean(model),
@@ -501,4 +513,5 @@ def _whitened(
         false_alarms=false_alarms,
         dt=dt,
         white=white,
+        watched=None if watched is Watched.RESIDUALS else watched.rows(model.errors.observer),
     )

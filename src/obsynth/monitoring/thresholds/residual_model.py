@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.methods.registry import error_model
 from obsynth.monitoring.thresholds.between_samples import IntersampleErrorSystem
+from obsynth.monitoring.thresholds.watched_rows import Watched
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
@@ -179,11 +180,6 @@ def _gathered(A: FloatArray, noise: FloatArray, dt: float) -> FloatArray:
     return np.asarray(discretise(plant, dt).plant.Bw)
 
 
-def watches_estimates(design: ObserverDesign) -> bool:
-    """Whether the fault estimates are watched, as the residual is made not to see the faults that are modelled."""
-    return "Phi" in design.certificate.matrices and bool(design.linear[1].fault_names)
-
-
 def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSignals) -> DescriptorSystem:
     """Return a plant with the noise of a scenario: its own, as often, and that of the sensors."""
     return plant.replace(
@@ -194,9 +190,9 @@ def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSign
 
 
 def residual_model(
-    design: ObserverDesign, scenario: Scenario, *, endless: bool = False, estimates: bool = False
+    design: ObserverDesign, scenario: Scenario, *, endless: bool = False, watched: Watched = Watched.RESIDUALS
 ) -> ResidualModel:
-    """Return the model of a design's residual on a scenario, or of its fault ``estimates``, zero but for errors."""
+    """Return the model of what is ``watched`` of a design on a scenario, zero but for errors."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = noisy_plant(plant, scenario, drive)
@@ -208,8 +204,8 @@ def residual_model(
     begun = np.zeros(errors.observer.order)
     begun[: observer.order] = observer_start(scenario, observer.order)
     initial = errors.own @ (plant.E @ start) - begun
-    reading, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
-    rows = observer.fault_rows if estimates else observer.residual_rows
+    rows = watched.rows(observer)
+    reading, _, direct_d, direct_w = errors.output(rows)
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
     a, driven, noise, continuous = errors.Az, errors.disturbance, errors.noise, None

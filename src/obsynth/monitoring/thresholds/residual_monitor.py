@@ -16,7 +16,7 @@ from obsynth.monitoring.thresholds.checked_options import checked_options
 from obsynth.monitoring.thresholds.guaranteed import record_monitor
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS
-from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model
 from obsynth.monitoring.thresholds.residual_norm_bounds import (
     norms_of_windows,
     paper_threshold,
@@ -25,6 +25,7 @@ from obsynth.monitoring.thresholds.residual_norm_bounds import (
     window_threshold,
 )
 from obsynth.monitoring.thresholds.rules import NormRule, WhitenedRule
+from obsynth.monitoring.thresholds.watched_rows import Watched, watched_by
 from obsynth.monitoring.thresholds.whitening import settled, steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.numerics.arrays import FloatArray
@@ -123,8 +124,9 @@ def monitor(
     bounds at all times, between samples too: it depends on the sample time, and all its terms are rounded outwards.
     What known inputs and the plant's start alone do to the sampled observer (which takes outputs as straight lines) is
     computed and added.  Plants of index 2 and more have no such bound.  Where the residual does not see the faults that
-    are modelled (``ui-pi-observer``), ``pointwise`` and ``window`` are of the fault estimates.  The statistical kinds
-    use disturbances that are held between samples, and exact covariances of the noise.
+    are modelled (``ui-pi-observer``, ``functional-filter``), all kinds but ``paper`` are of the fault estimates:
+    ``chi-square`` of the newest ones and of their means over the window.  The statistical kinds use disturbances that
+    are held between samples, and exact covariances of the noise.
 
     Examples
     --------
@@ -156,18 +158,18 @@ def monitor(
     if is_guaranteed(design):
         return record_monitor(design, scenario, kind, options)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
-    estimates = watches_estimates(design) and kind in ("pointwise", "window")
-    model = residual_model(design, scenario, estimates=estimates)
+    watched = watched_by(design, kind)
+    model = residual_model(design, scenario, watched=watched)
     model = model.held() if disturbance == "held" else model
     start = 0.0 if adaptive else model.initial_error
     start = start if initial_error is None else float(initial_error)
     bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
     observer = cast(LinearObserver, bench.observer)
-    rows = observer.fault_rows if estimates else observer.residual_rows
+    rows = watched.rows(observer)
     numbers: dict[str, Any] = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
     rule: Rule
     if kind in ("chi-square", "cusum"):
-        rule = _whitened_rule(kind, model, start, **numbers)
+        rule = _whitened_rule(kind, model, start, watched=watched, **numbers)
     else:
         inputs = _ResidualInputs(design, scenario, model, bounds, noise_bound, start)
         rule = _norm_rule(kind, inputs, gamma, window, rows, bench.signals.dt)
@@ -175,7 +177,7 @@ def monitor(
     quiet = bool(design.linear[0].nw and not noisy.linear[0].nw)
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start, noise_left_out=quiet)
     bounded = assumed if kind in ("pointwise", "window") else None
-    statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
+    statement = statement_of(kind, model, bounded, watched=watched, **numbers) + NO_TOLERANCE
     if adaptive:
         nominal = cast(NormRule, rule)
         rule, statement = over_box(
@@ -200,7 +202,7 @@ def monitor(
         dt=bench.signals.dt,
         floor=_floor(bench, design.linear[0], scenario, rows),
         isolation_delay=isolation_delay,
-        watches_estimates=estimates,
+        watched=watched,
     )
 
 
@@ -216,12 +218,20 @@ def require_no_region(design: ObserverDesign, kind: str) -> None:
 
 
 def _whitened_rule(
-    kind: str, model: ResidualModel, start: float, *, window: int, false_alarms: float, change: float, dt: float
+    kind: str,
+    model: ResidualModel,
+    start: float,
+    *,
+    watched: Watched,
+    window: int,
+    false_alarms: float,
+    change: float,
+    dt: float,
 ) -> WhitenedRule:
     """Return the rule of a statistical kind."""
     # A window that outlasts the scenario is refused before its covariance is factorised.
     first = settled(model, start, window)
-    whitener, white = whitened(kind, model, window)
+    whitener, white = whitened(kind, model, window, watched)
     # Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums.
     table, looks, degrees = np.full(model.steps, np.inf), model.steps - first, len(whitener)
     if kind == "chi-square":

@@ -184,7 +184,8 @@ class WindowRuleState(NamedTuple):
 class WhitenedRule(Rule):
     """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for a ``change``.
     ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`; ``table``: thresholds
-    of a record, in place of those for any number of looks."""
+    of a record, in place of those for any number of looks; ``watched``: rows of the observer that take the place of the
+    residual."""
 
     def __init__(
         self,
@@ -197,7 +198,9 @@ class WhitenedRule(Rule):
         dt: float,
         white: bool = True,
         table: FloatArray | None = None,
+        watched: slice | None = None,
     ) -> None:
+        self._watched = watched
         self.whitener, self._mean, self._change, self._window = whitener, mean, change, window
         self._probability, self._dt, self._white, self.table = false_alarms, dt, white, table
 
@@ -231,7 +234,9 @@ class WhitenedRule(Rule):
         state = state._replace(last=sample.time)
         if not sample.deciding:
             return state, NOT_DECIDED
-        state, value = self.fold(state, sample.residuals)
+        observation: Any = sample.observation
+        watched = sample.residuals if self._watched is None else observation.rows[self._watched]
+        state, value = self.fold(state, watched)
         if state.filled < self._window:
             return state, NOT_DECIDED
         state = state._replace(looks=state.looks + 1)

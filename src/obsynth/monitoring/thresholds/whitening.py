@@ -6,6 +6,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.residual_model import ResidualModel
+from obsynth.monitoring.thresholds.watched_rows import Watched
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import output_covariance, spectral_radius
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
@@ -62,9 +63,17 @@ def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def whitener_of(covariance: FloatArray) -> FloatArray:
     """Return ``Wh (rank, n)`` with ``Wh S Wh' = I`` for ``S (n, n)``; directions without any variance are left out."""
-    sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    units = _deviations(covariance)
+    sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0 / np.outer(units, units))
     significant = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
-    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T)
+    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T / units)
+
+
+def _deviations(covariance: FloatArray) -> FloatArray:
+    """Return the deviation of each component ``(n,)``, one where it has none: whether a direction has a variance is no
+    question of units."""
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return np.where(deviations > 0.0, deviations, 1.0)
 
 
 def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
@@ -74,11 +83,12 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     predict = covariance[old:, :old] @ past.T @ past
     error = np.hstack([-predict, np.eye(count)])
     innovation_covariance = error @ covariance @ error.T
-    sizes, vectors = np.linalg.eigh((innovation_covariance + innovation_covariance.T) / 2.0)
-    significant = sizes > CANCELLATION_TOLERANCE * float(np.max(np.abs(np.diag(covariance))))
+    units = _deviations(covariance)[old:]
+    sizes, vectors = np.linalg.eigh((innovation_covariance + innovation_covariance.T) / 2.0 / np.outer(units, units))
+    significant = sizes > CANCELLATION_TOLERANCE
     if not significant.any():
         raise SpecError("The newest residual is determined by the older ones: it has no innovation.", path="window")
-    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T @ error)
+    return np.asarray((vectors[:, significant] / np.sqrt(sizes[significant])).T / units @ error)
 
 
 def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) -> float:
@@ -112,11 +122,18 @@ def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]
     return whitener / np.sqrt(1.0 + 2.0 * correlations), correlations <= WHITE_CORRELATIONS
 
 
-def whitened(kind: str, model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
+def whitened(kind: str, model: ResidualModel, window: int, watched: Watched) -> tuple[FloatArray, bool]:
     """Return the whitener of ``chi-square`` or ``cusum``, and whether what it makes is white."""
-    if kind == "chi-square":
-        return whitener_of(window_covariance(model, window)), True
-    return cusum_whitener(model, window)
+    if kind == "cusum":
+        return cusum_whitener(model, window)
+    covariance = window_covariance(model, window)
+    if watched is Watched.RESIDUALS:
+        return whitener_of(covariance), True
+    # An observer's estimates hardly change from row to row, and those of a fault that stays do not: the newest ones
+    # tell a large fault at once, their means a small one, where a whole window has many degrees that tell neither.
+    newest, mean = np.eye(window)[-1:], np.full((1, window), 1.0 / window)
+    looked_at = np.kron(np.vstack([newest, mean]), np.eye(len(model.C)))
+    return whitener_of(looked_at @ covariance @ looked_at.T) @ looked_at, True
 
 
 def steady_mean(model: ResidualModel) -> FloatArray:
@@ -127,13 +144,14 @@ def steady_mean(model: ResidualModel) -> FloatArray:
 
 def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     """Return the first sample whose window is free of the start."""
-    deviation = float(np.sqrt(np.max(np.diag(window_covariance(model, 1)))))
+    deviations = np.sqrt(np.diag(window_covariance(model, 1)))
+    reading = model.C / np.where(deviations > 0.0, deviations, np.inf)[:, None]
     # The covariance and the mean have to settle as well, from a start of about the size of their own states.
     spread = _driving(model)[2]
     mean = np.linalg.norm(np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means))
     size = initial_error + float(np.sqrt(np.trace(spread))) + float(mean)
-    effects = np.array([np.linalg.norm(model.C @ power, 2) for power in model.powers()]) * size
-    late = np.flatnonzero(effects > START_EFFECT_SHARE * deviation)
+    effects = np.array([np.linalg.norm(reading @ power, 2) for power in model.powers()]) * size
+    late = np.flatnonzero(effects > START_EFFECT_SHARE)
     first = (int(late[-1]) + 1 if late.size else 0) + window - 1
     if spectral_radius(model.A) >= 1.0 or first >= model.steps:
         raise SpecError(

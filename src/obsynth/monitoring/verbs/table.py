@@ -52,7 +52,8 @@ plant's constants have tolerances, it adapts to the signals and holds for every 
 for each threshold, the guaranteed interval of each fault, and the share of each constant
   window      the same for the l2 norm of the residual over a window
   paper       linear, discrete: eq. (66) of Wang et al. 2015, which guarantees nothing
-  chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
+  chi-square  linear: a window of the residual against its covariance, or the fault estimates and their means over a\
+ window; recursive: the parameters against theirs
   cusum       cumulative sums: small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: normalised innovations squared, too large for the model
   learned     every design, and the only one for those over a region: thresholds from rows without faults\
