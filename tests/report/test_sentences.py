@@ -260,10 +260,13 @@ def test_noise_of_a_continuous_design_is_that_of_a_rate_of_readings(between: flo
         sensor_noise={"y1": 0.1, "y2": 0.2},
     )  # fmt: skip
     design = obsynth.ui_pi_observer(plant, decay=2.0)
-    line = " ".join(headline(design, None))
-    found = re.search(r"f1: ([\d.]+) exceeds 5 standard deviations of the noise if the sensors are read once a second, "
-                      r"sqrt\(T\) of it if every T seconds", line)  # fmt: skip
+    line, stated = (" ".join(headline(design, None, interval=interval)) for interval in (None, between))
+    told = r"f1: ([\d.]+) exceeds 5 standard deviations of the noise with a reading of the sensors every "
+    found = re.search(told + r"1 s, ([\d.]+) with one every 0.01 s ", line)
     assert found is not None, line
+    assert float(found.group(2)) == pytest.approx(0.1 * float(found.group(1)), rel=1e-2)
+    own = re.search(told + f"{between:g} s ", stated)
+    assert own is not None, stated
     observer, rows = design.linear[1], design.linear[1].fault_rows
     assert not observer.Dy[rows].any()
     n = observer.order
@@ -274,6 +277,7 @@ def test_noise_of_a_continuous_design_is_that_of_a_rate_of_readings(between: flo
         states, power = states + power @ power.T, whole[:n, :n] @ power
     deviation = np.sqrt((observer.Cz[rows] @ states @ observer.Cz[rows].T).item())
     assert 5.0 * deviation == pytest.approx(float(found.group(1)) * np.sqrt(between), rel=0.02)
+    assert 5.0 * deviation == pytest.approx(float(own.group(1)), rel=0.02)
 
 
 @pytest.mark.long

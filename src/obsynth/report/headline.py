@@ -31,6 +31,8 @@ DEVIATIONS = 5
 BEYOND = 2.0 * NormalDist().cdf(-float(DEVIATIONS))
 #: Faults that are reported.
 MOST_LISTED = 6
+#: Seconds between readings at which a continuous design's deviation is told where nothing says how often they come.
+USUAL_INTERVALS = (1.0, 0.01)
 
 
 @runtime_checkable
@@ -58,13 +60,15 @@ class DataRun(Protocol):
         """Levels by column."""
 
 
-def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
-    """Yield the first lines of a page: what happened in a log, then what the design can detect."""
+def headline(design: ObserverDesign, run: DataRun | None, *, interval: float | None = None) -> Iterator[str]:
+    """Yield the first lines of a page: what happened in a log, then what the design can detect.
+
+    ``interval``: seconds between readings of the sensors of a continuous design, where a scenario says it."""
     if run is not None:
         yield _of_run(run)
     if not design.report.passed:
         return  # nothing that such a design claims is reported as what it can do
-    lines = list(_of_test(GuaranteedTest.of(design)) if is_guaranteed(design) else _of_estimates(design))
+    lines = list(_of_test(GuaranteedTest.of(design)) if is_guaranteed(design) else _of_estimates(design, interval))
     if lines:
         yield '<div class="detected"><strong>What can be detected</strong><ul>'
         yield from (f"<li>{escape(line)}</li>" for line in lines[:MOST_LISTED])
@@ -103,7 +107,7 @@ def _of_test(test: GuaranteedTest) -> Iterator[str]:
     )
 
 
-def _of_estimates(design: ObserverDesign) -> Iterator[str]:
+def _of_estimates(design: ObserverDesign, interval: float | None) -> Iterator[str]:
     """Yield for each fault how small a step exceeds the noise of its estimate, how soon, and what looks like it."""
     observer = design.observer
     names = design.plant.noise_names if isinstance(design.plant, DescriptorSystem) else ()
@@ -120,10 +124,15 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
         deviation = figures["deviation"]
         if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
             # In continuous time noise has an intensity: that of the stated deviations, once a second.
+            intervals = (USUAL_INTERVALS if interval is None else (interval,)) if not timed else (1.0,)
+            first, *others = (_bound(DEVIATIONS * deviation * math.sqrt(seconds), unit) for seconds in intervals)
             if not timed:
-                when = " if the sensors are read once a second, sqrt(T) of it if every T seconds"
+                when = f" with a reading of the sensors every {duration(intervals[0])}"
+                when += "".join(
+                    f", {size} with one every {duration(s)}" for size, s in zip(others, intervals[1:], strict=True)
+                )
             sentence += (
-                f"{_bound(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise}{when} "
+                f"{first} exceeds {DEVIATIONS} standard deviations of {noise}{when} "
                 f"(false alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
             )
         else:

@@ -146,7 +146,7 @@ def html_report(
     state = "holds" if verified.report.passed else "fails"
     written = datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
     parts = [
-        *headline(verified, run),
+        *headline(verified, run, interval=None if scenario is None else scenario.sample_time),
         f'<p class="verdict {state}">{escape(verdict_line(verified.report.checks).plain)}</p>',
         f'<p class="soft">{escape(written)}; obsynth {__version__}; gain set {digest[:12]}</p>',
         f"<nav>{links}</nav>",
