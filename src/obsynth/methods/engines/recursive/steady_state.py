@@ -69,7 +69,9 @@ def steady_rows(
     contraction = prove_contraction(transition, discrete=True)
     claim = "errors decay with the listed gains, were they kept: modulus per step in a norm"
     source = f"{SOURCE}, (13); Lyapunov inequality of L A"
-    if contraction is None:
+    rate = None if contraction is None else proved_rate(transition, contraction)
+    # A rate that rounding leaves at one is none.
+    if contraction is None or rate is None or not rate < 1.0:
         radius = spectral_radius(transition.midpoint)
         if spectral_radius(recomputed.gain[:, :ne] @ A) >= CLEARLY_STABLE:
             yield information(
@@ -89,11 +91,10 @@ def steady_rows(
             detail="eigenvalues computed: no inequality was proved",
         )
         return
-    rate = proved_rate(transition, contraction)
     yield upper_bound_check(
         "steady state: contraction",
         claim,
-        np.nan if rate is None else rate,
+        rate,
         np.nextafter(1.0, 0.0),
         source=source,
         kind="proved",
