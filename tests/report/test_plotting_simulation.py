@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -15,7 +16,8 @@ import matplotlib.pyplot as plt
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.plotting import plot_detection, plot_simulation
+from obsynth.plotting import plot_detection, plot_simulation, plot_states
+from obsynth.report.plots.panels import image_of
 from obsynth.specs.loader import load_spec
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
@@ -108,3 +110,20 @@ def test_a_simulation_in_which_nothing_is_estimated_is_no_empty_picture() -> Non
         plot_simulation(simulation)
     with pytest.raises(SpecError, match=r"or simulation\.estimates"):
         obsynth.plotting.plot_states(simulation)
+
+
+def test_labels_beside_panels_one_above_the_other_do_not_cover_each_other() -> None:
+    names = ("delta GENCLS 1", "delta GENCLS 2", "temperature of the wall", "omega GENCLS 2")
+    plant = obsynth.DescriptorSystem(
+        A=0.5 * np.eye(4), C=np.eye(4), Bf=np.eye(4)[:, :1], Bd=np.eye(4)[:, 1:2], dt=1.0, state_names=names,
+        units=dict.fromkeys(names, "rad"),
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    estimates = obsynth.simulate(design, obsynth.Scenario(horizon=30)).estimates
+    drawn: list[plt.Axes] = []
+    image_of(
+        4, size=(7.5, 6.8), draw=lambda panels: drawn.extend(plot_states(estimates, units=plant.units, axes=panels))
+    )
+    boxes = [panel.yaxis.label.get_window_extent() for panel in drawn]
+    assert len(boxes) == 4
+    assert all(upper.y0 >= lower.y1 for upper, lower in pairwise(boxes))

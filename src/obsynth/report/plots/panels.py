@@ -66,8 +66,9 @@ MARK_STYLE: dict[str, Any] = {
 
 #: Units of a long time: its name, its seconds, and how many of it a record is longer than that is drawn in it.
 LONG_UNITS = (("d", 86400, 4), ("h", 3600, 3), ("min", 60, 10))
-#: Letters of a line beside a panel: longer names are broken.
-LABEL_LETTERS = 24
+
+#: Share of a panel's height, with the room below it, that a line beside it may take: longer names are broken.
+LABEL_SHARE = 0.9
 
 #: Letters of small print that fit in an inch, and those that the sample of a line takes.
 LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
@@ -157,10 +158,18 @@ def tidy(panel: Axes) -> None:
         panel.spines[side].set_visible(False)
     panel.margins(x=0.01)
     if "\n" not in (label := panel.get_ylabel()):
-        panel.set_ylabel(fill(label, LABEL_LETTERS, break_long_words=False))
+        panel.set_ylabel(fill(label, _letters_beside(panel), break_long_words=False))
     # A factor such as 1e-5 stands at the right: at the left is the legend.
     panel.yaxis.set_offset_position("right")
     names_as_they_are(panel)
+
+
+def _letters_beside(panel: Axes) -> int:
+    """Return how many letters a line beside a panel may have."""
+    place = panel.get_subplotspec()
+    rows = place.get_gridspec().nrows if place is not None else 1
+    height = panel.figure.bbox.height / panel.figure.dpi
+    return int(LABEL_SHARE * LETTERS_PER_INCH * height / rows)
 
 
 def one_panel(axes: Axes | None, *, size: tuple[float, float] | None = None) -> Axes:
