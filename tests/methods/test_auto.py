@@ -168,3 +168,27 @@ def test_a_scenario_says_the_noise_and_how_large_faults_are() -> None:
     # Beside a scenario of another plant the choice is as without one.
     other = obsynth.Scenario(horizon=1.0, faults={"nobody": obsynth.Step(size=1.0)})
     assert obsynth.design(plant, scenario=other).method == obsynth.design(plant).method
+
+
+def test_what_ranks_above_the_choice_is_named_and_what_does_not_exist() -> None:
+    """A heated room in which people act as a draught does: a PD observer's estimate of a lost heater shows people."""
+    conductances = np.array([[-310.0, 180.0, 90.0], [180.0, -180.0, 0.0], [90.0, 0.0, -120.0]])
+    room = obsynth.DescriptorSystem(
+        np.diag([4e5, 6e4, 2e6]), conductances, C=np.eye(3), Bf=[[0, 1], [-1, 0], [0, 0]], Bd=[[1], [0], [0]],
+        fault_names=("lost power", "draught"), disturbance_names=("people",),
+        sensor_noise={"y1": 0.05, "y2": 0.2, "y3": 0.1},
+    )  # fmt: skip
+    design = obsynth.design(room)
+    assert design.method == "pd-observer"
+    why = design.notes[0]
+    for missing in ("fault-estimation-filter", "ui-pi-observer", "functional-filter"):
+        assert missing in why.partition("none exists")[0]
+    assert "optimal-filter is not among these, and ranks above it" in why
+    # Which is so: it decouples the heater.
+    crowd = obsynth.Scenario(horizon=3e5, sample_time=1000.0, disturbances={"people": obsynth.Step(size=100.0)})
+    shown = [
+        float(np.max(np.abs(obsynth.simulate(each, crowd).estimates.faults[:, 0])))
+        for each in (design, obsynth.optimal_filter(room))
+    ]
+    assert shown[0] > 10.0
+    assert shown[1] < 0.1 * shown[0]

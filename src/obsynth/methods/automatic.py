@@ -8,7 +8,6 @@ from typing import Any
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.candidates import Candidate, Maker, candidate_designs, linear_methods, methods_with
-from obsynth.methods.fault_figures import largest_gain
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Purpose
 from obsynth.methods.registry import kind_of, methods_for
@@ -16,7 +15,12 @@ from obsynth.numerics.arguments import field_types
 from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number
 from obsynth.simulation.scenario import Scenario
+
+#: The method of the least gain, which has options of its own for what is least: it is not chosen, but named where it
+#: ranks above what is, of plants of few states, for which it takes a fraction of a second.
+LEAST, COMPARED_STATES = "optimal-filter", 20
 
 
 def automatic_design(
@@ -69,7 +73,8 @@ def _chosen(
     scenario: Scenario | None,
 ) -> ObserverDesign:
     """Return the best design for a plant with faults."""
-    entries = candidate_designs(plant, options, possible, maker, scenario)
+    methods = methods_with("faults", possible)
+    entries = candidate_designs(plant, options, methods, maker, scenario)
     candidates = [entry for entry in entries if entry.design is not None]
     if not candidates:
         # Where the method with the weakest conditions does not exist, its reason holds for all of them.
@@ -80,19 +85,33 @@ def _chosen(
     best, *ranked_below = sorted(candidates, key=lambda entry: entry.rank(plant.nd > 0, settling))
     if best.design is None:
         raise PreconditionError("No method exists for this plant.", condition="existence")
-    return _with_note(best.design, reason(best, ranked_below, plant))
+    least: list[Candidate] = []
+    if LEAST in possible and plant.nx <= COMPARED_STATES:
+        least = [
+            entry
+            for entry in candidate_designs(plant, options, [LEAST], maker, scenario)
+            if entry.design is not None and entry.rank(plant.nd > 0, settling) < best.rank(plant.nd > 0, settling)
+        ]
+    return _with_note(
+        best.design, reason(best, ranked_below, plant, [name for name in methods if name != best.method], least)
+    )
 
 
-def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem) -> str:
-    """Return in one sentence why a candidate ranks first."""
+def reason(
+    best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem, others: list[str], better: list[Candidate]
+) -> str:
+    """Return in one sentence why a candidate ranks first; ``others``: methods that it was chosen among; ``better``:
+    those that rank above it, which are not."""
+    above = "".join(
+        f"; {entry.method} is not among these, and ranks above it: {_figures_in_words(entry, plant)}"
+        for entry in better
+    )
     if not ranked_below:
-        return "no other method exists for this plant"
+        return (
+            f"of {', '.join(others)} none exists for this plant{above}" if others else "the only one with these options"
+        )
     parts = ["its estimates reach every step"] if best.rank(False)[0] == 0.0 else []
-    if plant.nd:
-        parts.append(f"gain from the unknown inputs {largest_gain(best.figures):.3g}")
-    deviation = ", ".join(f"{fault.deviation:.3g}" for fault in best.figures)
-    delay = ", ".join(f"{fault.most:.3g}" for fault in best.figures)
-    parts.append(f"90 % of a step after {delay} s, with a deviation of {deviation}")
+    parts.append(_figures_in_words(best, plant))
     below = ", ".join(
         f"{other.method} (its noise hides {' and '.join(other.hidden)} of the scenario)"
         if other.hidden and not best.hidden
@@ -101,7 +120,24 @@ def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSyst
     )
     if best.hidden:
         parts.append(f"its noise hides {' and '.join(best.hidden)} of the scenario")
-    return f"{'; '.join(parts)}; ranked below it: {below}; obsynth compare ranks by errors over a scenario instead"
+    return (
+        f"{'; '.join(parts)}; ranked below it: {below}{above}; obsynth compare ranks by errors over a scenario instead"
+    )
+
+
+def _figures_in_words(entry: Candidate, plant: DescriptorSystem) -> str:
+    """Return by what a candidate is ranked."""
+    gains = f"gain from the unknown inputs {joined(fault.unknown_input_gain for fault in entry.figures)}; "
+    deviations, delays = (
+        joined(fault.deviation for fault in entry.figures),
+        joined(fault.most for fault in entry.figures),
+    )
+    return f"{gains if plant.nd else ''}90 % of a step after {delays} s, with a deviation of {deviations}"
+
+
+def joined(values: Iterable[float]) -> str:
+    """Return numbers in words."""
+    return ", ".join(number(value, digits=3) for value in values)
 
 
 def _with_note(design: ObserverDesign, why: str) -> ObserverDesign:

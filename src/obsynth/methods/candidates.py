@@ -127,7 +127,7 @@ class Candidate:
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(fault.reaches for fault in self.figures))
-        coupled = float(has_unknown_inputs and any(fault.unknown_input_share > DECOUPLED for fault in self.figures))
+        coupled = float(has_unknown_inputs and sum(fault.unknown_input_share > DECOUPLED for fault in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides the deviation by the root of T and delays by T: averaging keeps this product.
         products = [fault.deviation * np.sqrt(max(fault.most, dt)) for fault in self.figures]
@@ -212,7 +212,7 @@ def candidate_designs(
     maker: Maker,
     scenario: Scenario | None = None,
 ) -> list[Candidate]:
-    """Return a candidate for each method that estimates faults, designed in the plant's own time.
+    """Return a candidate for each of some methods that estimate faults, designed in the plant's own time.
 
     All figures are at one sample time: the plant's own, the scenario's, or a share of the plant's settling time.
     """
@@ -225,11 +225,7 @@ def candidate_designs(
         # The plant has no proper sampled form, so there are no figures by which to compare.
         return []
     own_time, expected = plant.dt == 0.0, scenario_figures(sampled, scenario)
-    fitting = [
-        method
-        for method in methods_with("faults", methods)
-        if not (plant.dt > 0.0 and method_class(method).time == "continuous")
-    ]
+    fitting = [method for method in methods if not (plant.dt > 0.0 and method_class(method).time == "continuous")]
     return [
         candidate(method, plant, sampled, steps, maker, options, continuous=own_time, expected=expected)
         for method in fitting
