@@ -22,6 +22,9 @@ from obsynth.simulation.scenario import Scenario
 #: ranks above what is, of plants of few states, for which it takes a fraction of a second.
 LEAST, COMPARED_STATES = "optimal-filter", 20
 
+#: By so much noise and delay together must be less.
+WORTH_NAMING = 1.05
+
 
 def automatic_design(
     plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker, scenario: Scenario | None = None
@@ -90,26 +93,30 @@ def _chosen(
         least = [
             entry
             for entry in candidate_designs(plant, options, [LEAST], maker, scenario)
-            if entry.design is not None and entry.rank(plant.nd > 0, settling) < best.rank(plant.nd > 0, settling)
+            if entry.design is not None
+            and _is_better(entry.rank(plant.nd > 0, settling), best.rank(plant.nd > 0, settling))
         ]
-    return _with_note(
-        best.design, reason(best, ranked_below, plant, [name for name in methods if name != best.method], least)
-    )
+    missing = [entry.method for entry in entries if entry.design is None]
+    return _with_note(best.design, reason(best, ranked_below, plant, missing, least))
+
+
+def _is_better(rank: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    """Return whether a rank is above another by more than what is not worth a word."""
+    return (*rank[:-1], rank[-1] * WORTH_NAMING) < other
 
 
 def reason(
-    best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem, others: list[str], better: list[Candidate]
+    best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem, missing: list[str], better: list[Candidate]
 ) -> str:
-    """Return in one sentence why a candidate ranks first; ``others``: methods that it was chosen among; ``better``:
-    those that rank above it, which are not."""
+    """Return in one sentence why a candidate ranks first; ``missing``: methods among which it was chosen and which
+    do not exist; ``better``: those that rank above it, among which it was not."""
     above = "".join(
         f"; {entry.method} is not among these, and ranks above it: {_figures_in_words(entry, plant)}"
         for entry in better
     )
     if not ranked_below:
-        return (
-            f"of {', '.join(others)} none exists for this plant{above}" if others else "the only one with these options"
-        )
+        none = f"of {', '.join(missing)} none exists for this plant" if missing else "the only one with these options"
+        return none + above
     parts = ["its estimates reach every step"] if best.rank(False)[0] == 0.0 else []
     parts.append(_figures_in_words(best, plant))
     below = ", ".join(
