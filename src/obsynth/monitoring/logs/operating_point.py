@@ -45,10 +45,15 @@ class OperatingPointCheck:
             self._sum[finite] += row[finite]
             self._count[finite] += 1.0
 
-    def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
+    def alarm_of_the_start(
+        self, design: ObserverDesign, alarms: Sequence[AlarmEvent], *, warm_up: float
+    ) -> tuple[str, ...]:
         """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
-        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start.
-        Other designs leave out the first row as an outlier where it is so far away."""
+        ends, `SETTLED_TO` of it are left, or more after a shorter one than the default, which is more than the noise
+        where the outputs begin far from the start.  Other designs leave out the first row as an outlier where it is so
+        far away.
+
+        ``warm_up``: seconds."""
         observer, plant = design.observer, design.plant
         refused = self.status == GAP and bool(np.isfinite(self._start).all())
         if refused and any(event.first_row <= HOLD for event in alarms):
@@ -65,19 +70,24 @@ class OperatingPointCheck:
             return ()
         shares = np.where(comparable, started, 0.0) / np.where(comparable, noise, 1.0)
         worst = int(np.argmax(shares))
-        if shares[worst] * SETTLED_TO <= 1.0:
+        usual = transient(observer)
+        left = SETTLED_TO ** (warm_up / usual) if usual > 0.0 else 0.0
+        if shares[worst] * left <= 1.0:
             return ()
-        lasting = transient(observer) * math.log(shares[worst]) / -math.log(SETTLED_TO)
+        lasting = usual * math.log(shares[worst]) / -math.log(SETTLED_TO)
         if not any(event.start < self._begin + lasting for event in alarms):
             return ()
+        from obsynth.results.layout import duration, number  # with rich, which a run without warnings does not need
+
         name = plant.output_names[worst]
         is_stated = name in self._signals.point
         where = "its operating point" if is_stated else "zero (no operating point is stated)"
         advice = "Give" if is_stated else "State the operating point at which the log begins, or give"
         return (
-            f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
+            f"An alarm in the first {duration(lasting)} may be the initial-condition response: {name} begins "
             f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "
-            f"{100.0 * SETTLED_TO:g} % of that response are left. {advice} a longer warm-up (--warm-up {lasting:.3g}).",
+            f"{number(100.0 * left, digits=2)} % of that response are left. {advice} a longer warm-up (--warm-up "
+            f"{np.format_float_positional(lasting, precision=3, fractional=False, trim='-')}).",
         )
 
     def warnings(self) -> tuple[str, ...]:

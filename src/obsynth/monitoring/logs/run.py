@@ -351,7 +351,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
     """Return what happened in a run that has ended: counts of rows, alarms, outliers, stuck sensors and warnings."""
     runs_by_output = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
     stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in runs_by_output if runs}
-    start = () if resumed else run.first.alarm_of_the_start(design, run.events.events())
+    start = () if resumed else run.first.alarm_of_the_start(design, run.events.events(), warm_up=run.observer.warm_up)
     return DataRun(
         rows=run.rows,
         statuses=dict(run.statuses),

@@ -36,6 +36,7 @@ from obsynth.report.plots.panels import (
     with_unit,
 )
 from obsynth.results.design import ObserverDesign, unverified_mark
+from obsynth.results.layout import number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,6 +54,9 @@ MOST_DRAWN = 6
 
 #: A statistic this many times above its threshold gets a logarithmic axis.
 _FAR_ABOVE = 30.0
+
+#: The initial-condition response leaves the picture where the range with it is this many times that of decided rows.
+HIDING = 8.0
 
 #: Rows in which nothing is decided lie in grey, those with an alarm in red.
 _UNDECIDED_ROWS: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
@@ -125,6 +129,10 @@ def plot_data(
     for panel, (part, name) in zip(panels, plans, strict=True):
         _shade(panel, run.table, explained, _alarm_rows(run, run.table, part, name))
         getattr(drawing, part)(panel, name)
+        if part in ("faults", "residuals"):
+            _show_decided_rows(
+                panel, run, run.table, [name] if part == "faults" else _residuals_of(run.table, design, name)
+            )
         legend_above(panel)
         tidy(panel)
     mark = "" if design is None or not design.report.checks else unverified_mark(design.report)
@@ -190,6 +198,11 @@ def _residual_units(columns: Iterable[Any], design: ObserverDesign | None) -> di
     return {name: unit if (unit := units.get(name[2:-1], "")) != "1" else "" for name in names}
 
 
+def _residuals_of(table: pd.DataFrame, design: ObserverDesign | None, unit: str) -> list[str]:
+    """Return the residuals of a unit."""
+    return [name for name, own in _residual_units(table.columns, design).items() if own == unit]
+
+
 @dataclass(frozen=True)
 class _Drawing:
     """What is drawn of a run: one method for each kind of panel, by its name, for the signal of that panel."""
@@ -248,8 +261,7 @@ class _Drawing:
 
     def residuals(self, panel: Axes, unit: str) -> None:
         """Draw the residuals of a unit with the thresholds of the run."""
-        units = _residual_units(self.table.columns, self.design)
-        names = [name for name, own in units.items() if own == unit]
+        names = _residuals_of(self.table, self.design, unit)
         for name, colour in zip(names, LINE_COLOURS, strict=False):
             style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": colour}
             panel.plot(self.table["time"], self.table[name], label=name, **style)
@@ -309,6 +321,31 @@ class _Drawing:
             return None
         rows = (check.value for check in self.design.report.checks if check.name == f"noise in {column}")
         return next(map(float, rows), None)
+
+
+def _show_decided_rows(panel: Axes, run: DataRun, table: pd.DataFrame, columns: Sequence[str]) -> None:
+    """Let the initial-condition response leave the picture where it would hide all that comes after it."""
+    values = table[list(columns)].to_numpy(float)
+    decided = values[table["status"].isin(DECIDING).to_numpy()]
+    low, high = panel.get_ylim()
+    own = decided[np.isfinite(decided)]
+    if not own.size:
+        return
+    levels = [abs(run.thresholds.get(name, 0.0)) for name in columns]
+    size = max(float(np.ptp(own)), *levels)
+    if not high - low > HIDING * size > 0.0:
+        return
+    reached = max(values[np.isfinite(values)], key=abs)
+    panel.set_ylim(float(own.min()) - 0.5 * size, float(own.max()) + 0.5 * size)
+    panel.annotate(
+        f"warm-up and gaps: up to {number(float(reached), digits=3)}",
+        (0.0, 1.0),
+        xycoords="axes fraction",
+        xytext=(4, -4),
+        textcoords="offset points",
+        va="top",
+        fontsize=7,
+    )
 
 
 def _limits(panel: Axes, centre: float, level: float, label: str, style: dict[str, Any]) -> None:
