@@ -38,13 +38,16 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, contraction_of
 
 #: Rates below this, in 1/s, are those of an observer that does not settle.
 SLOWEST = 1e-300
 
 #: A filter is as fast as another one where its slowest error needs this many times as long.
 AS_FAST = 1.001
+
+#: How often a default whose stability is not proved becomes half as fast.
+MOST_SLOWER = 6
 
 #: Of a filter that is noisier, only one that is so many times as fast is worth it.
 FAR_SLOWER = 3.0
@@ -163,6 +166,11 @@ def synthesise(
     synthesis = assembled(working, model, gains, poles, dict(claims), structured=not method.joint)
     unused = left_out(working, *gains[1:]) if method.leaves_freedom_to_us else ""
     more = (f"No use is made of {unused}: with all outputs the gains for these poles are noisier.",) if unused else ()
+    by_default = method.poles is None and method.decay is None and region is None
+    if by_default and contraction_of(synthesis.linear_observer) is None:
+        slower = _slower(plant, method, synthesis, progress=progress)
+        if slower is not None:
+            return slower
     return Synthesis(
         method.resolved(model, plant.fault_names),
         synthesis.gains,
@@ -172,6 +180,28 @@ def synthesise(
         (*notes(known, problem, method, synthesis.certificate.claims), *more),
         known.transformation,
     )
+
+
+def _slower(
+    plant: DescriptorSystem, method: UiPiObserver, synthesis: Synthesis, *, progress: Callable[[str], None]
+) -> Synthesis | None:
+    """Return a slower observer than one by default whose stability is not proved, as its gains are too large for double
+    precision; ``None`` where none is found."""
+    decay = synthesis.certificate.claims.get("decay", 0.0)
+    for halvings in range(1, MOST_SLOWER + 1 if decay > 0.0 else 1):
+        rate = decay * 2.0**-halvings
+        progress("choosing slower gains, as the stability of these cannot be proved")
+        try:
+            found = synthesise(plant, replace(method, decay=rate), progress=progress)
+        except SolverError:
+            continue
+        if contraction_of(found.linear_observer) is not None:
+            why = (
+                f"decay = {rate:.3g} 1/s was taken: twice the rate, which the noise allows, has gains with which "
+                "stability is not proved in double precision."
+            )
+            return replace(found, notes=(why, *found.notes))
+    return None
 
 
 def _require_stable_fixed_modes(problem: PlacementProblem) -> None:
