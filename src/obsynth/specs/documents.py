@@ -18,6 +18,7 @@ from obsynth.plants.other_names import name_meant
 from obsynth.specs.lines import composed, line_of
 from obsynth.specs.remedies import (
     MISSING_KEYS,
+    instead_of_kind,
     instead_of_list,
     instead_of_mapping,
     instead_of_matrix,
@@ -419,7 +420,8 @@ def _remedy(kind: str, key: str, value: Any, folder: Path, expected: str, *, in_
     if key == "method":
         return f" Write method: {{id: {value}}}." if isinstance(value, str) else ""
     if kind == "literal_error":
-        return suggestion(str(value), re.findall(r"'([^']*)'", expected))
+        other = instead_of_kind(value) if key == "kind" else ""
+        return other or suggestion(str(value), re.findall(r"'([^']*)'", expected))
     if kind in ("dict_type", "model_type"):
         return instead_of_mapping(key, value)
     if kind == "string_type":

@@ -39,6 +39,16 @@ MISSING_KEYS = {
     "schema_version": "write schema_version: 1",
 }
 
+#: What kinds of signals are called elsewhere, and how they are written here.
+OTHER_KINDS = {
+    **dict.fromkeys(("constant", "const", "bias", "offset"), "kind: step, size: 1 (from the first sample on)"),
+    **dict.fromkeys(("pulse", "impulse", "rectangle"), "kind: step, size: 1, start: 10, end: 20"),
+    **dict.fromkeys(("square", "pulses"), "kind: intermittent, size: 1, period: 10"),
+    **dict.fromkeys(("normal", "noise", "white", "random", "randn"), "kind: gaussian, or kind: uniform"),
+    **dict.fromkeys(("sinusoid", "sin", "cosine", "harmonic"), "kind: sine"),
+    **dict.fromkeys(("table", "csv", "file", "data", "series", "interpolated"), "kind: time-table"),
+}
+
 #: So many keys of a section are listed in a message.
 MOST_KEYS = 15
 
@@ -49,6 +59,12 @@ LARGEST_EXAMPLE = 12
 def instead_of_nothing(key: str) -> str:
     """Return what to write for a key without a value."""
     return f" {MISSING_KEYS[key][0].upper()}{MISSING_KEYS[key][1:]}." if key in MISSING_KEYS else f" Leave {key} out."
+
+
+def instead_of_kind(value: Any) -> str:
+    """Return how a signal of a kind that has another name here is written."""
+    meant = OTHER_KINDS.get(value.lower()) if isinstance(value, str) else None
+    return f" Write {meant}." if meant else ""
 
 
 def instead_of_mapping(key: str, value: Any) -> str:
