@@ -353,11 +353,8 @@ def validate(
     passed = total.holds and not sentences
     if not (passed or total.holds or ratios) and explained is None:
         far = "small" if total.value > total.high else "large"
-        noise = "The stated noise is" if linear else "Q and R are"
-        together = " all" if linear else " together"
-        sentences.append(
-            f"{noise} too {far}{together}: the innovations are {np.sqrt(total.value):.2g} times what is expected."
-        )
+        noise = "The stated noise is altogether" if linear else "Q and R together are"
+        sentences.append(f"{noise} too {far}: the innovations are {np.sqrt(total.value):.2g} times what is expected.")
     error = _integration_error(design.observer, record_log, record)
     if error is not None and error.matters:
         sentences.append(

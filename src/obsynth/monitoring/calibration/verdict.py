@@ -133,6 +133,11 @@ def on_innovations(nis: Consistency, colours: dict[str, Whiteness], row: int | N
     return sentences
 
 
+def _rows_away(rows: int) -> str:
+    """Return a number of rows, which is negative for earlier ones, in words."""
+    return f"{abs(rows)} {'row' if abs(rows) == 1 else 'rows'} {'later' if rows > 0 else 'earlier'}"
+
+
 def on_log(
     problem: CalibrationProblem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
 ) -> list[str]:
@@ -152,8 +157,8 @@ def on_log(
     if lost > NOTED_NATS:
         least = min(losses, key=lambda rows: losses[rows])
         sentences.append(
-            f"Inputs that act {least:+d} {'row' if abs(least) == 1 else 'rows'} later would be better by {lost:.1f} "
-            "nats: see input_delay."
+            f"Inputs that act {_rows_away(least - delay)} than is taken here would be better by {lost:.1f} nats: give "
+            f"input_delay = {least} if the log is so late."
         )
     if error is not None:
         used = "Radau" if problem.integration == "radau" else "backward Euler"
