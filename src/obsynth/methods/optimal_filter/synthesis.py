@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,8 +12,6 @@ import numpy as np
 from obsynth.errors import InfeasibleError, PreconditionError, SolverError, counted
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
-from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
-from obsynth.methods.optimal_filter.common_numbers import with_fault_map
 from obsynth.methods.optimal_filter.delays import delays_of, in_words, is_auto, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import (
@@ -29,24 +26,20 @@ from obsynth.methods.optimal_filter.fault_maps import (
     unit_of_gains,
     without_filter,
 )
-from obsynth.methods.optimal_filter.follower import Followed, before_delay, behind_delay, error_model_of
+from obsynth.methods.optimal_filter.follower import Followed, behind_delay, error_model_of
 from obsynth.methods.optimal_filter.lasting_modes import (
     ADDED_DRIVES,
     with_growing_modes_reached,
     with_lasting_modes_driven,
 )
-from obsynth.methods.optimal_filter.late_outputs import later_inputs, with_late_outputs
+from obsynth.methods.optimal_filter.late_outputs import with_late_outputs
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
-from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
 from obsynth.methods.optimal_filter.realisation import (
-    followed,
-    followed_later,
-    observer_of,
-    realisations,
     without_undriven,
 )
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order, free_filters
 from obsynth.methods.optimal_filter.reference import plain
+from obsynth.methods.optimal_filter.shipped_numbers import EXACT_SHARE, realisation_of
 from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
@@ -61,7 +54,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import unused_names
 from obsynth.results.design import Certificate
-from obsynth.verification.error_system import IDENTITY_SHARE
 from obsynth.verification.inequalities import stability_factor
 from obsynth.verification.seen_outputs import seen_plant
 from obsynth.verification.signals_from_rest import has_index_one
@@ -70,8 +62,6 @@ from obsynth.verification.signals_from_rest import has_index_one
 DELAY_ROOM = 1.05
 #: Delays that are tried after the first one that exists, and at most where each is better than that by `DELAY_ROOM`.
 MORE_DELAYS, MOST_MORE_DELAYS = 4, 8
-#: The fault map of a filter for added noise is kept to this share, which leaves room below what verification allows.
-EXACT_SHARE = 0.3 * FAULT_MAP_SHARE
 #: Gain and least gain that differ by no more than this share are together.
 CLOSED_GAP = 3e-5
 #: Noise of the sensors that is tried to bring them together, of the outputs' sizes; with more states it takes too long.
@@ -357,7 +347,7 @@ def _of_at_most(
 ) -> tuple[Followed, LinearObserver] | None:
     """Return a filter's realisation; ``None`` where it has more states, or no longer the fault map."""
     try:
-        follower, observer, missed = _realised(plant, chosen, norm)
+        follower, observer, missed = realisation_of(plant, chosen, norm)
     except SolverError:
         return None
     fits = observer.order - follower.undriven <= limit and missed <= EXACT_SHARE
@@ -384,7 +374,7 @@ def _with_enough_noise(
     best: tuple[float, tuple[Designed, Followed, LinearObserver]] | None = None
     while True:
         try:
-            follower, observer, missed = _realised(plant, chosen, norm)
+            follower, observer, missed = realisation_of(plant, chosen, norm)
             # Noise that carries none, beside undriven modes, would count in the mean square of this plant.
             if norm == "h2" and not plant.is_discrete and not chosen.fault_map.undriven:
                 missed = max(missed, _lost_share(plant, chosen, follower, observer))
@@ -396,7 +386,7 @@ def _with_enough_noise(
                 zero = without_filter(plant, chosen, norm)
                 if zero is None:
                     raise
-                return (zero, *_realised(plant, zero, norm)[:2])
+                return (zero, *realisation_of(plant, zero, norm)[:2])
         if best is not None and (best[0] <= EXACT_SHARE or not more):
             return best[1]
         try:
@@ -419,53 +409,6 @@ def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: Followed, o
     if chosen.is_nothing:
         return 0.0 if np.isfinite(own) else math.inf
     return abs(own - chosen.gain) / chosen.gain if np.isfinite(own) else math.inf
-
-
-def _realised(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Followed, LinearObserver, float]:
-    """Return a filter's realisation, and by which share it misses its fault map."""
-    problem, fault_map = chosen.problem, chosen.fault_map
-    later = later_inputs(plant, chosen.filter) if problem.shift else 0
-    outputs = PlantUnits.of(plant).rounded().outputs
-    ways = realisations(chosen.filter, outputs, discrete=plant.is_discrete)
-    # One of few states may follow the plant by states that y does not reach.
-    ways += [chosen.filter] if chosen.least is not None else []
-    white = norm == "h2" and not plant.is_discrete
-    if white:
-        ways = without_white_noise(plant, fault_map, ways)
-    finished = partial(with_digits_of, plant, fault_map) if white else _unchanged
-    longest = problem.window + problem.shift
-    follower = (
-        followed_later(plant, ways, longest, later) if later else followed(plant, ways, longest, finished=finished)
-    )
-    observer, missed_identities, missed = _followed_by(plant, fault_map, follower)
-    if not missed_identities <= IDENTITY_SHARE:
-        raise SolverError(
-            "The numbers of the filter of least gain follow the plant by rounding only, as none of its outputs shows "
-            f"its states by more: the result is inconclusive. Take norm: {'hinf' if norm == 'h2' else 'h2'}, or a "
-            "reference model of a hundredth of the bandwidth: either gave a filter where this was seen."
-        )
-    if missed > EXACT_SHARE:
-        exact = with_fault_map(plant, fault_map.behind_delay(later), follower)
-        own, missed_identities, less = _followed_by(plant, fault_map, exact)
-        if missed_identities <= IDENTITY_SHARE and less < missed:
-            return exact, own, less
-    return follower, observer, missed
-
-
-def _followed_by(
-    plant: DescriptorSystem, fault_map: FaultMap, follower: Followed
-) -> tuple[LinearObserver, float, float]:
-    """Return the observer of a filter, and by which shares it misses what it follows and an exact fault map."""
-    rows = len(follower.C)
-    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-    observer = observer_of(plant, follower, names, fault_map.delays or (0,) * rows)
-    observer = before_delay(observer, follower.later)
-    model = error_model_of(plant, observer, follower)
-    return observer, model.missed(), fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
-
-
-def _unchanged(follower: Followed) -> Followed:
-    return follower
 
 
 class _Row(NamedTuple):
