@@ -18,6 +18,16 @@ from numpy.typing import NDArray
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.common_numbers import with_common_numbers
 from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.transformation import (
+    CLEANED_SHARES,
+    FEWEST_ENTRIES,
+    IDENTITIES_LEFT,
+    MOST_ENTRIES,
+    FilterAndPlant,
+    by_sylvester,
+    holds,
+    shows_a_disturbance,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.low_order_models import plainly_truncated
@@ -27,15 +37,8 @@ from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.verification.error_system import IDENTITY_SHARE, LEAST_ROW, ErrorModel, with_past
+from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel, with_past
 
-#: The identities of T and T0 hold to this, of the numbers in them: to the second where no realisation keeps the first.
-IDENTITIES_LEFT = (1e-9, 1e-8)
-#: Entries of T and T0 that are smaller, of the largest, are rounding: by the second share where a decoupled disturbance
-#: drives nothing but states that no output shows, of which T must have nothing.
-CLEANED_SHARES = (1e-13, 1e-8)
-#: Of what a decoupled disturbance does to the filter, by each of its ways, no more than this is left of them together.
-DISTURBANCE_LEFT = 1e-8
 #: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
 ROUNDING_SHARE = 1e-14
 #: What passes at once and is smaller, of what passes by way of the states, is rounding: it is a difference of products.
@@ -307,6 +310,13 @@ def _followed(
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
     bd = np.vstack([plant.Bd, np.zeros((na - plant.nx, plant.nd))])
     left_kernel = left_kernel_of(e)
+    if exactly and not count and nz * na >= FEWEST_ENTRIES:
+        of = FilterAndPlant(a, b, c, d, e, own, dd_past, bd, plant.Dd, left_kernel)
+        found = by_sylvester(of, np.tile(PlantUnits.of(plant).rounded().equations, 1 + lag))
+        # All equations together have the smallest rest, which not many unknowns are worth.
+        if found is not None and (found[2] == IDENTITIES_LEFT[0] or nz * na > MOST_ENTRIES):
+            t, s, share = found
+            return Followed(a, b, c, d, t, s @ left_kernel, lag, 0), share
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
     # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
     sizes = [nz * na, nz * count, rows * len(left_kernel), rows * count]
@@ -397,9 +407,10 @@ def _cleaned_solution(
     for share in IDENTITIES_LEFT:
         for cleaned in CLEANED_SHARES:
             solution = np.where(sizes > cleaned * largest, exact, 0.0)
-            if not _holds(system, solution, wanted, heights, width, share):
+            missed, terms = np.abs(system @ solution - wanted[0]), np.abs(system) @ np.abs(solution) + wanted[1]
+            if not holds(missed, terms, heights, width, share):
                 break
-            if not _shows_a_disturbance(system, solution, wanted, heights, disturbances):
+            if not shows_a_disturbance(missed, terms, heights, disturbances):
                 return solution, share
         else:
             return solution, share
@@ -427,46 +438,6 @@ def _solved(system: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatAr
         missed = scale * (wanted - system @ solution)
         solution = solution + units * scipy.linalg.lstsq(scaled, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
     return solution, units
-
-
-def _holds(
-    system: FloatArray,
-    solution: FloatArray,
-    wanted: tuple[FloatArray, FloatArray],
-    heights: tuple[int, ...],
-    width: int,
-    share: float,
-) -> bool:
-    """Whether equations hold, each to a share of the largest term of its row of the filter, as they are verified.
-
-    ``wanted``: the right sides, and the sizes of what cancels in them.
-    """
-    missed, terms = np.abs(system @ solution - wanted[0]), np.abs(system) @ np.abs(solution) + wanted[1]
-    ends = np.cumsum(heights)
-    for part, height in ((slice(0, ends[0]), heights[0]), (slice(ends[1], ends[2]), heights[2])):
-        if height:
-            largest = np.max(terms[part].reshape(-1, width), axis=1)
-            largest = np.maximum(largest, LEAST_ROW * np.max(largest))
-            if np.any(np.max(missed[part].reshape(-1, width), axis=1) > share * largest):
-                return False
-    return bool(np.max(missed, initial=0.0) <= share * (1.0 + np.max(terms, initial=0.0)))
-
-
-def _shows_a_disturbance(
-    system: FloatArray,
-    solution: FloatArray,
-    wanted: tuple[FloatArray, FloatArray],
-    heights: tuple[int, ...],
-    disturbances: int,
-) -> bool:
-    """Whether more is left of some decoupled disturbance than a share of what cancels."""
-    missed, terms = np.abs(system @ solution - wanted[0]), np.abs(system) @ np.abs(solution) + wanted[1]
-    ends = np.cumsum(heights)
-    own = np.r_[ends[0] : ends[1], ends[2] : len(missed)]
-    if not disturbances or not len(own):
-        return False
-    largest, size = (np.max(part[own].reshape(-1, disturbances), axis=0) for part in (missed, terms))
-    return bool(np.any(largest > DISTURBANCE_LEFT * size))
 
 
 def left_kernel_of(e: FloatArray) -> FloatArray:
