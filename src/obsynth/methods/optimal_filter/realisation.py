@@ -312,11 +312,13 @@ def _followed(
     left_kernel = left_kernel_of(e)
     if exactly and not count and nz * na >= FEWEST_ENTRIES:
         of = FilterAndPlant(a, b, c, d, e, own, dd_past, bd, plant.Dd, left_kernel)
-        found = by_sylvester(of, np.tile(PlantUnits.of(plant).rounded().equations, 1 + lag))
+        found, single = by_sylvester(of, np.tile(PlantUnits.of(plant).rounded().equations, 1 + lag))
         # All equations together have the smallest rest, which not many unknowns are worth.
-        if found is not None and (found[2] == IDENTITIES_LEFT[0] or nz * na > MOST_ENTRIES):
-            t, s, share = found
-            return Followed(a, b, c, d, t, s @ left_kernel, lag, 0), share
+        many = nz * na > MOST_ENTRIES
+        if found is not None and (found.share == IDENTITIES_LEFT[0] or many):
+            return Followed(a, b, c, d, found.T, found.S @ left_kernel, lag, 0), found.share
+        if single and many:
+            return None, IDENTITIES_LEFT[-1]
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
     # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
     sizes = [nz * na, nz * count, rows * len(left_kernel), rows * count]

@@ -69,8 +69,16 @@ def _sums(of: FilterAndPlant, t: FloatArray, s: FloatArray, sign: float) -> Floa
     return np.concatenate([part.ravel() for part in sums])
 
 
-def by_sylvester(of: FilterAndPlant, units: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return T and S, and the share of `IDENTITIES_LEFT` to which they keep the identities; ``None`` where they do not.
+class Transformation(NamedTuple):
+    """T and S, with ``T0 = S N``, and the share of `IDENTITIES_LEFT` to which they keep the identities."""
+
+    T: FloatArray
+    S: FloatArray
+    share: float
+
+
+def by_sylvester(of: FilterAndPlant, units: FloatArray) -> tuple[Transformation | None, bool]:
+    """Return T and S, ``None`` where they do not keep the identities, and whether there is no other T than this.
 
     Parameters
     ----------
@@ -81,8 +89,8 @@ def by_sylvester(of: FilterAndPlant, units: FloatArray) -> tuple[FloatArray, Flo
     """
     t = pencil_sylvester(of.a, of.A, of.E, -of.b @ of.C)
     if t is None:
-        return None
-    less_exact: tuple[FloatArray, FloatArray, float] | None = None
+        return None, False
+    less_exact: Transformation | None = None
     for share in IDENTITIES_LEFT:
         for cleaned in _cleaned(t / units):
             own = cleaned * units
@@ -91,11 +99,11 @@ def by_sylvester(of: FilterAndPlant, units: FloatArray) -> tuple[FloatArray, Flo
             if not holds(missed, terms, of.heights(), len(of.E), share):
                 continue
             if not shows_a_disturbance(missed, terms, of.heights(), of.Bd.shape[1]):
-                return own, s, share
-            less_exact = less_exact or (own, s, share)
+                return Transformation(own, s, share), True
+            less_exact = less_exact or Transformation(own, s, share)
         if less_exact is not None:
-            return less_exact
-    return None
+            return less_exact, True
+    return None, True
 
 
 def _cleaned(t: FloatArray) -> Iterator[FloatArray]:
