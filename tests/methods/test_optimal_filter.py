@@ -645,8 +645,8 @@ def test_one_square_weight_of_noise_and_faults_together_is_refused_and_each_by_i
         ({"inputs": {"w1": 0.0}}, "is zero"),
         ({"errors": {"f1": "much"}}, "a number"),
         ({"errors": {"f1": np.nan}}, "a number"),
-        ({"errors": {"f1": control.tf([1.0], [1.0, -0.5], True)}}, "no stable inverse.*Multiply it by z"),
         ({"errors": {"f1": control.tf([1.0, -2.0], [1.0, -0.5], True)}}, "no stable inverse"),
+        ({"errors": {"f1": control.tf([1.0, -2.0], [1.0, -0.5, 0.0, 0.0], True)}}, "no stable inverse"),
         ({"inputs": {"w1": control.tf([1.0], [1.0, -1.5], True)}}, "not stable"),
         ({"inputs": {"w1": control.tf([1.0], [1.0, 1.5])}}, "dt"),
         ({"inputs": {"w1": {"D": [[1.0, 2.0]]}}}, "one of each"),
@@ -658,12 +658,21 @@ def test_weights_that_are_none_are_refused(weights, words) -> None:
         obsynth.optimal_filter(STATIC, delay=0, weights=weights)
 
 
-def test_a_weight_that_is_multiplied_by_z_has_its_size_and_a_stable_inverse() -> None:
-    """As the refusal of one that is strictly proper says."""
-    late = {"num": [0.5], "den": [1.0, -0.5]}
-    design = obsynth.optimal_filter(TWO, delay=0, weights={"errors": {"f1": {**late, "num": [0.5, 0.0]}}})
+@pytest.mark.parametrize("late", [0, 1, 2])
+def test_a_weight_with_fewer_zeros_than_poles_counts_by_its_size(late: int, tmp_path) -> None:
+    weight = {"num": [0.5], "den": [1.0, -0.5, 0.0, 0.0][: 2 + late]}
+    design = obsynth.optimal_filter(TWO, delay=0, weights={"errors": {"f1": weight}})
     assert design.gain == pytest.approx(0.5**0.5, rel=1e-6)  # |0.5 / (z - 0.5)| is one at z = 1
     assert design.least == pytest.approx(0.5**0.5, rel=1e-4)
+    assert obsynth.verify(obsynth.load(design.save(tmp_path / "a.gains.json"))).passed
+
+
+def test_a_weight_of_all_errors_with_fewer_zeros_than_poles_is_refused_with_what_to_do() -> None:
+    late = control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2)), True)
+    with pytest.raises(obsynth.SpecError, match=r"no stable inverse.*Multiply it by z"):
+        obsynth.optimal_filter(PAIR, delay=1, weights={"errors": late})
+    whole = control.ss(0.5 * np.eye(2), np.eye(2), 0.5 * np.eye(2), np.eye(2), True)  # z / (z - 0.5), as it says
+    assert obsynth.optimal_filter(PAIR, delay=1, weights={"errors": whole}).report.passed
 
 
 def test_claims_are_of_the_weights_that_are_stored(tmp_path) -> None:

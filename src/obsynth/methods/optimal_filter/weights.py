@@ -2,7 +2,8 @@
 
 The gain of the weighted problem is that from n to ``We e``, where ``w = Ww n`` (and ``f = Wf n`` where faults drive
 the error).  A filter for ``We e`` gives ``We fhat``; the inverse of We behind it gives fhat, so that every We must pass
-at once and have strictly stable zeros.  That of a group may be one square model that couples its signals.
+at once and have strictly stable zeros.  That of a group may be one square model that couples its signals.  In sampled
+time a weight of one signal with fewer zeros than poles is taken without its delay, which changes no size.
 """
 
 from __future__ import annotations
@@ -62,6 +63,8 @@ def weights_of(option: Any, plant: DescriptorSystem, *, rows: int, exact: bool) 
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     coupled = _coupled(option.get(ERRORS), names, plant, ERRORS)
     errors = {} if coupled is not None else _by_name(option.get(ERRORS), names, plant, ERRORS)
+    if plant.is_discrete:
+        errors = {name: _without_delay(model) for name, model in errors.items()}
     inverted = {f"{ERRORS}.{name}": model for name, model in errors.items()} if coupled is None else {ERRORS: coupled}
     for name, model in inverted.items():
         _require_inverse(model, plant, name)
@@ -163,6 +166,16 @@ def _weight(value: Any, plant: DescriptorSystem, name: str) -> Model:
             path=path,
         )
     return model
+
+
+def _without_delay(model: Model) -> Model:
+    """Return a sampled model of one signal times z for each zero that is missing."""
+    a, b, c, d = model
+    for _ in range(len(a)):
+        if d.any():
+            break
+        c, d = c @ a, c @ b
+    return a, b, c, d
 
 
 def _require_inverse(model: Model, plant: DescriptorSystem, name: str) -> None:
