@@ -7,8 +7,8 @@ import pytest
 
 import obsynth
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.methods.optimal_filter.passed_at_once import _answer, _shown_at_once, with_digits_of, without_white_noise
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter
 
 NX, STILL = 4, 2
 
@@ -56,7 +56,7 @@ def test_of_index_two_d_and_t0_pass_no_white_noise_but_by_rounding() -> None:
     )  # fmt: skip
     # T0 E = 0 leaves of T0 the last equation: 0.7 3 - 1.05 2 = 0.
     t0 = np.array([[0.0, 0.0, 1.05], [0.0, 0.0, 1e-13]])
-    stated = Followed(
+    stated = RealisedFilter(
         *(np.zeros(shape) for shape in ((0, 0), (0, 2), (2, 0))),
         D=np.array([[0.7 * (1.0 + 1e-11), 1e-12], [0.0, 1e-12]]),
         T=np.zeros((0, 3)),
@@ -79,7 +79,7 @@ def test_of_index_two_rounding_in_a_coordinate_of_t0_passes_no_white_noise() -> 
         Bw=[[0.0], [2.0], [0.0], [3.0]], Dw=[[0.0]], dt=0.0,
     )  # fmt: skip
     assert not plant.E[[1, 3]].any()
-    stated = Followed(
+    stated = RealisedFilter(
         *(np.zeros(shape) for shape in ((0, 0), (0, 1), (1, 0))),
         D=np.zeros((1, 1)),
         T=np.zeros((0, 4)),

@@ -65,7 +65,7 @@ def test_their_summary_is_taken_once_however_many_numbers_they_are(
 
 def test_from_several_threads_they_are_those_of_one() -> None:
     observer = obsynth.descriptor_kalman(plant(0.825), Q=0.01).observer
-    gain_schedule._followed.cache_clear()
+    gain_schedule._computed_gains.cache_clear()
     expected = list(gain_steps(observer, 60))
     with ThreadPoolExecutor(4) as pool:
         for steps in pool.map(lambda count: list(shared_gains(observer, count)), (60, 20, 60, 40)):
@@ -74,7 +74,7 @@ def test_from_several_threads_they_are_those_of_one() -> None:
 
 def test_after_an_error_they_begin_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     observer = obsynth.descriptor_kalman(plant(0.835), Q=0.01).observer
-    gain_schedule._followed.cache_clear()
+    gain_schedule._computed_gains.cache_clear()
     expected = list(gain_steps(observer, 9))
 
     def interrupted(*arguments: object, **options: object):

@@ -11,7 +11,7 @@ import scipy.linalg
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed, designed
-from obsynth.methods.optimal_filter.follower import Followed, error_model_of
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter, error_model_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
@@ -64,7 +64,7 @@ MORE_SAMPLES, MOST_UNKNOWNS = 3, 150
 
 
 def certified(
-    plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: Followed, norm: str
+    plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: RealisedFilter, norm: str
 ) -> tuple[dict[str, FloatArray], dict[str, float]]:
     """Return the claims of a filter and their witnesses; raise `SolverError` where no gain near its own is proved."""
     fault_map = chosen.fault_map

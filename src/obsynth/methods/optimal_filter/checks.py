@@ -17,8 +17,8 @@ from obsynth.methods.optimal_filter.fault_maps import (
     least_deviation_of_every_start,
     response_at,
 )
-from obsynth.methods.optimal_filter.follower import behind_delay
 from obsynth.methods.optimal_filter.realisation import with_modes
+from obsynth.methods.optimal_filter.realised_filter import behind_delay
 from obsynth.methods.optimal_filter.reference import stored_reference
 from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arguments import is_whole

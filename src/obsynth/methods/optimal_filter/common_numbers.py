@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -27,7 +27,7 @@ SMALLEST_SEEN = 1e-12
 SOLUTIONS = 3
 
 
-def with_common_numbers(plant: DescriptorSystem, follower: Followed) -> Followed | None:
+def with_common_numbers(plant: DescriptorSystem, follower: RealisedFilter) -> RealisedFilter | None:
     """Return a filter whose T and B, changed by rounding, follow the plant; ``None`` where it is no rounding.
 
     ``plant``: with the disturbances that are decoupled.
@@ -37,7 +37,7 @@ def with_common_numbers(plant: DescriptorSystem, follower: Followed) -> Followed
     return corrected if changed <= LOST_DIGITS else None
 
 
-def with_fault_map(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
+def with_fault_map(plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter) -> RealisedFilter:
     """Return a filter whose T and B follow the plant and make the faults pass by their fault map.
 
     Of faults that the outputs hardly show, what passes is a small difference of large numbers.
@@ -47,7 +47,7 @@ def with_fault_map(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
     return _corrected(plant, follower, np.vstack([system, rows]), np.concatenate([wanted, passed]))[0]
 
 
-def _identities(plant: DescriptorSystem, follower: Followed) -> tuple[FloatArray, FloatArray]:
+def _identities(plant: DescriptorSystem, follower: RealisedFilter) -> tuple[FloatArray, FloatArray]:
     """Return the equations of T and B, row by row, that its identities are with A, C, D and T0."""
     a, c, own_states = follower.A, follower.C, np.eye(len(follower.A))
     e, own, _, shown = with_past(plant, follower.lag)
@@ -63,7 +63,9 @@ def _identities(plant: DescriptorSystem, follower: Followed) -> tuple[FloatArray
     return system, np.concatenate([np.zeros(len(a) * (len(e) + plant.nd)), outputs.ravel()])
 
 
-def _faults_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> tuple[FloatArray, FloatArray]:
+def _faults_passed(
+    plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter
+) -> tuple[FloatArray, FloatArray]:
     """Return the equations of T and B by which faults pass by their fault map, at more points than it has states."""
     count = len(follower.T[0]) - plant.nx
     bf = np.vstack([plant.Bf, np.zeros((count, plant.nf))])
@@ -78,8 +80,8 @@ def _faults_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
 
 
 def _corrected(
-    plant: DescriptorSystem, follower: Followed, system: FloatArray, wanted: FloatArray
-) -> tuple[Followed, float]:
+    plant: DescriptorSystem, follower: RealisedFilter, system: FloatArray, wanted: FloatArray
+) -> tuple[RealisedFilter, float]:
     """Return a filter with the nearest T and B that solve equations, and the largest share of a row that was changed.
 
     Each row may change by shares of its largest number, in units in which the plant is near one; what is zero stays.

@@ -198,8 +198,8 @@ class OptimalFilterMethod(Method):
 
         Modes of the plant that the errors hold are states of the observer here, which nothing drives.  Of outputs that
         show inputs of later samples it is the observer behind a delay."""
-        from obsynth.methods.optimal_filter.follower import behind_delay
         from obsynth.methods.optimal_filter.realisation import with_modes
+        from obsynth.methods.optimal_filter.realised_filter import behind_delay
 
         (plant, observer), matrices = design.linear, design.certificate.matrices
         later = int(matrices["later"][0, 0]) if "later" in matrices else 0

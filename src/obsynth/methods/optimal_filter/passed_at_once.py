@@ -14,8 +14,8 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.methods.optimal_filter.fault_maps import FaultMap
-from obsynth.methods.optimal_filter.follower import Followed
 from obsynth.methods.optimal_filter.realisation import left_kernel_of
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter
 from obsynth.methods.optimal_filter.weights import in_series
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
@@ -68,7 +68,7 @@ def _shown_at_once(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, Flo
     return faults, disturbances, noise
 
 
-def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
+def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter) -> RealisedFilter:
     """Return a filter that passes no white noise at once but by rounding, with the T0 that follows.
 
     ``plant``: continuous, of any index, with the disturbances that are decoupled.
@@ -82,7 +82,7 @@ def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Follo
     return _without_rounding_passed(plant, fault_map, follower)
 
 
-def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: Followed) -> Followed:
+def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter) -> RealisedFilter:
     """Return a filter whose D and T0, changed by rounding of each entry, pass at once what the fault map passes.
 
     Of an index of 2 or more what passes by the states hangs on T, too: ``D Dw - T0 Bw`` is what is stored of it.  Of

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.common_numbers import with_common_numbers
-from obsynth.methods.optimal_filter.follower import Followed
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter
 from obsynth.methods.optimal_filter.transformation import (
     CLEANED_SHARES,
     FEWEST_ENTRIES,
@@ -135,25 +135,27 @@ def _cleaned(matrix: FloatArray, share: float = ROUNDING_SHARE) -> FloatArray:
     return np.where(np.abs(matrix) > share * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
-def followed(
+def filter_with_error_system(
     plant: DescriptorSystem,
     filters: Sequence[Model],
     longest: int,
     *,
-    finished: Callable[[Followed], Followed],
-) -> Followed:
-    """Return the first of some realisations of a filter that follows the plant; raise `SolverError` where none does.
+    finished: Callable[[RealisedFilter], RealisedFilter],
+) -> RealisedFilter:
+    """Return the first realisation of a filter that has an error system; raise `SolverError` where none has.
 
-    ``plant``: with the disturbances that are decoupled; ``longest``: the most past states that T may be on;
-    ``finished``: what is done to the digits of one.
+    ``plant`` contains the disturbances that are decoupled. ``longest`` is the largest number of past states that T may
+    act on. ``finished`` adjusts the last digits of a realisation.
     """
-    follower = _first_followed(plant, filters, longest, finished)
-    if follower.lag or _is_followed(plant, follower):
+    follower = _first_with_error_system(plant, filters, longest, finished)
+    if follower.lag or _keeps_identities(plant, follower):
         return follower
     return with_common_numbers(plant, follower) or follower
 
 
-def followed_later(plant: DescriptorSystem, filters: Sequence[Model], longest: int, later: int) -> Followed:
+def realised_behind_delay(
+    plant: DescriptorSystem, filters: Sequence[Model], longest: int, later: int
+) -> RealisedFilter:
     """Return a realisation, behind ``later`` samples of delay, of a filter that shows inputs so many samples later.
 
     Its errors are a state only there; known inputs must not be among those that it needs before they have acted.
@@ -165,7 +167,7 @@ def followed_later(plant: DescriptorSystem, filters: Sequence[Model], longest: i
             a = np.block([[a, np.zeros((order, rows))], [c, np.zeros((rows, rows))]])
             b, c, d = np.vstack([b, d]), np.hstack([np.zeros((rows, order)), np.eye(rows)]), np.zeros_like(d)
         delayed.append((a, b, c, d))
-    found = followed(plant, delayed, longest, finished=lambda follower: follower)
+    found = filter_with_error_system(plant, delayed, longest, finished=lambda follower: follower)
     # The copies of modes come last: the delay does behind them.
     whole = next(len(a) for a, *_ in delayed if np.array_equal(a, found.A[: len(a), : len(a)]))
     own = whole - later * len(found.C)
@@ -180,19 +182,22 @@ def followed_later(plant: DescriptorSystem, filters: Sequence[Model], longest: i
     )
 
 
-def _first_followed(
-    plant: DescriptorSystem, filters: Sequence[Model], longest: int, finished: Callable[[Followed], Followed]
-) -> Followed:
+def _first_with_error_system(
+    plant: DescriptorSystem,
+    filters: Sequence[Model],
+    longest: int,
+    finished: Callable[[RealisedFilter], RealisedFilter],
+) -> RealisedFilter:
     none = np.zeros((0, plant.nx)), np.zeros((0, 0))
     copies = _dying_modes(plant)
     lags = ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1)))
-    less_exact: Followed | None = None
+    less_exact: RealisedFilter | None = None
     for lag, (rows, moved) in lags:
         if lag == 0 and rows is copies[0] and not len(rows):
             continue
         for filter_ in filters:
-            follower, share = _followed(plant, filter_, rows, moved, lag)
-            if follower is not None and len(rows) and not _is_followed(plant, follower):
+            follower, share = _realised_with_lag(plant, filter_, rows, moved, lag)
+            if follower is not None and len(rows) and not _keeps_identities(plant, follower):
                 # Copies that are hardly read were left out, of which a filter that follows little else has much.
                 continue
             if follower is not None and share == IDENTITIES_LEFT[0]:
@@ -200,9 +205,9 @@ def _first_followed(
             less_exact = less_exact or follower
         if lag == 0 and rows is none[0] and less_exact is None:
             for filter_ in filters:
-                nearly, _ = _followed(plant, filter_, *none, 0, exactly=False)
+                nearly, _ = _realised_with_lag(plant, filter_, *none, 0, exactly=False)
                 follower = None if nearly is None else with_common_numbers(plant, finished(nearly))
-                if follower is not None and _is_followed(plant, follower):
+                if follower is not None and _keeps_identities(plant, follower):
                     return follower
     if less_exact is not None:
         return finished(less_exact)
@@ -212,7 +217,7 @@ def _first_followed(
     )
 
 
-def _is_followed(plant: DescriptorSystem, follower: Followed) -> bool:
+def _keeps_identities(plant: DescriptorSystem, follower: RealisedFilter) -> bool:
     """Whether a filter with its copies keeps the identities, of the numbers that are stored, as they are verified."""
     names = tuple(f"estimate {i + 1}" for i in range(len(follower.C)))
     observer = observer_of(plant, follower, names, (0,) * len(names))
@@ -221,7 +226,7 @@ def _is_followed(plant: DescriptorSystem, follower: Followed) -> bool:
 
 
 def observer_of(
-    plant: DescriptorSystem, error_system: Followed, names: tuple[str, ...], delays: tuple[int, ...]
+    plant: DescriptorSystem, error_system: RealisedFilter, names: tuple[str, ...], delays: tuple[int, ...]
 ) -> LinearObserver:
     """Return the observer; known inputs enter it as they do the plant."""
     t, t0 = error_system.T[:, : plant.nx], error_system.T0[:, : plant.nx]
@@ -244,7 +249,9 @@ def observer_of(
     )
 
 
-def without_undriven(observer: LinearObserver, follower: Followed) -> tuple[LinearObserver, dict[str, FloatArray]]:
+def without_undriven(
+    observer: LinearObserver, follower: RealisedFilter
+) -> tuple[LinearObserver, dict[str, FloatArray]]:
     """Return an observer without copies that nothing drives, which stay at zero, and what its errors hold of them."""
     own = observer.order - follower.undriven
     if own == observer.order:
@@ -294,7 +301,7 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     return rows, moved
 
 
-def _followed(
+def _realised_with_lag(
     plant: DescriptorSystem,
     filter_: Model,
     copied: FloatArray,
@@ -302,7 +309,7 @@ def _followed(
     lag: int,
     *,
     exactly: bool = True,
-) -> tuple[Followed | None, float]:
+) -> tuple[RealisedFilter | None, float]:
     """Return a filter beside copies ``copied`` of modes, with T and T0, and the share of `IDENTITIES_LEFT` to which
     every equation holds; ``None`` where one misses all of them, ``exactly`` or beside the largest of all terms."""
     a, b, c, d = filter_
@@ -316,7 +323,7 @@ def _followed(
         # All equations together have the smallest rest, which not many unknowns are worth.
         many = nz * na > MOST_ENTRIES
         if found is not None and (found.share == IDENTITIES_LEFT[0] or many):
-            return Followed(a, b, c, d, found.T, found.S @ left_kernel, lag, 0), found.share
+            return RealisedFilter(a, b, c, d, found.T, found.S @ left_kernel, lag, 0), found.share
         if single and many:
             return None, IDENTITIES_LEFT[-1]
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
@@ -362,7 +369,7 @@ def _followed(
     into, c_past, moved = into @ basis, c_past @ basis, basis.T @ moved @ basis
     moved[driven_count:, :driven_count] = 0.0
     copies, copy_count = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
-    follower = Followed(
+    follower = RealisedFilter(
         np.block([[a, into], [np.zeros((copy_count, nz)), moved]]),
         np.vstack([b, np.zeros((copy_count, plant.ny))]),
         np.hstack([c, c_past]),

@@ -17,10 +17,15 @@ from obsynth.errors import SolverError
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
 from obsynth.methods.optimal_filter.common_numbers import with_fault_map
 from obsynth.methods.optimal_filter.fault_maps import Designed, FaultMap
-from obsynth.methods.optimal_filter.follower import Followed, before_delay, error_model_of
 from obsynth.methods.optimal_filter.late_outputs import later_inputs
 from obsynth.methods.optimal_filter.passed_at_once import with_digits_of, without_white_noise
-from obsynth.methods.optimal_filter.realisation import followed, followed_later, observer_of, realisations
+from obsynth.methods.optimal_filter.realisation import (
+    filter_with_error_system,
+    observer_of,
+    realisations,
+    realised_behind_delay,
+)
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter, before_delay, error_model_of
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -34,7 +39,9 @@ EXACT_SHARE = 0.3 * FAULT_MAP_SHARE
 STEADY_SHARE = 0.3 * STEADY_ERROR
 
 
-def realisation_of(plant: DescriptorSystem, chosen: Designed, norm: str) -> tuple[Followed, LinearObserver, float]:
+def realisation_of(
+    plant: DescriptorSystem, chosen: Designed, norm: str
+) -> tuple[RealisedFilter, LinearObserver, float]:
     """Return a filter's realisation with its observer, and by which share it misses its fault map."""
     problem, fault_map = chosen.problem, chosen.fault_map
     later = later_inputs(plant, chosen.filter) if problem.shift else 0
@@ -48,7 +55,9 @@ def realisation_of(plant: DescriptorSystem, chosen: Designed, norm: str) -> tupl
     finished = partial(with_digits_of, plant, fault_map) if white else _unchanged
     longest = problem.window + problem.shift
     follower = (
-        followed_later(plant, ways, longest, later) if later else followed(plant, ways, longest, finished=finished)
+        realised_behind_delay(plant, ways, longest, later)
+        if later
+        else filter_with_error_system(plant, ways, longest, finished=finished)
     )
     observer, missed_identities, missed = _followed_by(plant, fault_map, follower)
     if not missed_identities <= IDENTITY_SHARE:
@@ -65,7 +74,7 @@ def realisation_of(plant: DescriptorSystem, chosen: Designed, norm: str) -> tupl
         # A realisation of another size may keep digits that this one loses, on one processor and not on another.
         for way in ways:
             with suppress(SolverError):
-                one = followed(plant, [way], longest, finished=finished)
+                one = filter_with_error_system(plant, [way], longest, finished=finished)
                 others += _of_the_fault_map(plant, fault_map, [one])
     best = min(others, key=lambda other: (not other.keeps_digits, max(other.shares)))
     return best[:3]
@@ -74,7 +83,7 @@ def realisation_of(plant: DescriptorSystem, chosen: Designed, norm: str) -> tupl
 class Realised(NamedTuple):
     """A filter with its observer, the share by which it misses its fault map, and its error of a constant fault."""
 
-    follower: Followed
+    follower: RealisedFilter
     observer: LinearObserver
     missed: float
     steady_error: float
@@ -91,7 +100,7 @@ class Realised(NamedTuple):
 
 
 def _of_the_fault_map(
-    plant: DescriptorSystem, fault_map: FaultMap, followers: Sequence[Followed]
+    plant: DescriptorSystem, fault_map: FaultMap, followers: Sequence[RealisedFilter]
 ) -> Iterator[Realised]:
     """Yield the filters whose T and B, changed by rounding, make the faults pass by their fault map."""
     for follower in followers:
@@ -120,7 +129,7 @@ def _steady_error(plant: DescriptorSystem, fault_map: FaultMap, observer: Linear
 
 
 def _followed_by(
-    plant: DescriptorSystem, fault_map: FaultMap, follower: Followed
+    plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter
 ) -> tuple[LinearObserver, float, float]:
     """Return the observer of a filter, and by which shares it misses what it follows and an exact fault map."""
     rows = len(follower.C)
@@ -131,5 +140,5 @@ def _followed_by(
     return observer, model.missed(), fault_map_missed(model, fault_map)[0] if fault_map.exact else 0.0
 
 
-def _unchanged(follower: Followed) -> Followed:
+def _unchanged(follower: RealisedFilter) -> RealisedFilter:
     return follower

@@ -26,7 +26,6 @@ from obsynth.methods.optimal_filter.fault_maps import (
     unit_of_gains,
     without_filter,
 )
-from obsynth.methods.optimal_filter.follower import Followed, behind_delay, error_model_of
 from obsynth.methods.optimal_filter.lasting_modes import (
     ADDED_DRIVES,
     with_growing_modes_reached,
@@ -37,6 +36,7 @@ from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import (
     without_undriven,
 )
+from obsynth.methods.optimal_filter.realised_filter import RealisedFilter, behind_delay, error_model_of
 from obsynth.methods.optimal_filter.reduced_order import filters_of_order, free_filters
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.optimal_filter.shipped_numbers import EXACT_SHARE, realisation_of
@@ -293,7 +293,7 @@ def _made(
 
 
 def _recomputed_gain(
-    plant: DescriptorSystem, chosen: Designed, follower: Followed, observer: LinearObserver, norm: str
+    plant: DescriptorSystem, chosen: Designed, follower: RealisedFilter, observer: LinearObserver, norm: str
 ) -> float:
     """Return the norm of a filter on a plant, which need not be the one that it was searched for."""
     channel = ErrorChannel.of(error_model_of(plant, observer, follower), chosen.fault_map)
@@ -305,7 +305,7 @@ def _recomputed_gain(
     return float(hinf_norm(a, b, c, d).upper)
 
 
-_Realised: TypeAlias = tuple[Designed, Followed, LinearObserver]
+_Realised: TypeAlias = tuple[Designed, RealisedFilter, LinearObserver]
 
 
 def _of_low_order(plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str) -> _Realised:
@@ -344,7 +344,7 @@ def _best_of(
 
 def _of_at_most(
     plant: DescriptorSystem, chosen: Designed, limit: int, norm: str
-) -> tuple[Followed, LinearObserver] | None:
+) -> tuple[RealisedFilter, LinearObserver] | None:
     """Return a filter's realisation; ``None`` where it has more states, or no longer the fault map."""
     try:
         follower, observer, missed = realisation_of(plant, chosen, norm)
@@ -364,14 +364,14 @@ def _reduced_note(chosen: Designed, order: int, full: int, claims: Mapping[str, 
 
 def _with_enough_noise(
     plant: DescriptorSystem, chosen: Designed, norm: str
-) -> tuple[Designed, Followed, LinearObserver]:
+) -> tuple[Designed, RealisedFilter, LinearObserver]:
     """Return a filter and its realisation, for the least added noise with which this keeps its digits.
 
     The poles of a filter without noise run to infinity: the nearer they are to it, the fewer digits are left.
     """
     may_have_more = chosen.least is None or (norm == "h2" and not plant.is_discrete)
     more = [noise for noise in ADDED_NOISES if noise > chosen.added_noise and may_have_more]
-    best: tuple[float, tuple[Designed, Followed, LinearObserver]] | None = None
+    best: tuple[float, tuple[Designed, RealisedFilter, LinearObserver]] | None = None
     while True:
         try:
             follower, observer, missed = realisation_of(plant, chosen, norm)
@@ -403,7 +403,7 @@ def _with_enough_noise(
         more = [noise for noise in more[1:] if noise > chosen.added_noise]
 
 
-def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: Followed, observer: LinearObserver) -> float:
+def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: RealisedFilter, observer: LinearObserver) -> float:
     """Return by which share the mean square of the stored numbers, its root, is another one than that of the design."""
     own = _recomputed_gain(plant, chosen, follower, observer, "h2")
     if chosen.is_nothing:

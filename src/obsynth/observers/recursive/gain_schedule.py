@@ -123,19 +123,19 @@ def shared_gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
     if steps * (plant.nx + plant.nq) * (plant.ne + plant.ny) > MOST_KEPT_GAINS:
         yield from gain_steps(observer, steps)
         return
-    followed = _followed(observer)
-    known = followed.steps
+    computed = _computed_gains(observer)
+    known = computed.steps
     for position in range(steps + int(observer.early_constraints)):
-        yield known[position] if position < len(known) else followed.at(position)
+        yield known[position] if position < len(known) else computed.at(position)
 
 
 @lru_cache(maxsize=OBSERVERS_KEPT)
-def _followed(observer: RecursiveObserver) -> _Followed:
-    return _Followed(observer)
+def _computed_gains(observer: RecursiveObserver) -> _ComputedGains:
+    return _ComputedGains(observer)
 
 
-class _Followed:
-    """The gains of an observer as far as somebody looked at them."""
+class _ComputedGains:
+    """The gains of an observer, computed up to the last step that was asked for, and kept."""
 
     def __init__(self, observer: RecursiveObserver) -> None:
         self.steps: list[GainStep] = []

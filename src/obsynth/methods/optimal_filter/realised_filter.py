@@ -1,4 +1,4 @@
-"""Filters that read y alone, with matrices T and T0 that relate the filter's state to that of the plant."""
+"""A realised filter that reads y alone, with the matrices T and T0 that relate its state to that of the plant."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
 
 
-class Followed(NamedTuple):
-    """A filter ``z+ = A z + B y``, rows ``C z + D y``, copies of modes included, with T and T0.
+class RealisedFilter(NamedTuple):
+    """A filter ``z+ = A z + B y`` with the outputs ``C z + D y``, and the matrices T and T0 of its error system.
 
-    Where u alone acts on the plant, ``z = T E xa``, xa the state with its last ``lag`` ones, and the rows are zero:
-    ``A T E + B C = T Aa``, ``C T E + D C = T0 Aa``, ``T0 E = 0``; with ``Bd`` in place of u's columns likewise.
+    ``xa`` is the plant's state stacked with its last ``lag`` values. While only u acts on the plant, ``z = T E xa`` and
+    the outputs are zero: ``A T E + B C = T Aa``, ``C T E + D C = T0 Aa`` and ``T0 E = 0``. The same holds with ``Bd``
+    in place of the columns of u. Some states may be copies of modes of the plant.
     """
 
     A: FloatArray
@@ -27,12 +28,12 @@ class Followed(NamedTuple):
     T: FloatArray
     T0: FloatArray
     lag: int
-    undriven: int = 0  # so many last states are copies of modes that no known input drives
-    later: int = 0  # T and T0 are of the filter behind so many samples of delay, whose states are the last ones
+    undriven: int = 0  # number of last states that copy modes which no known input drives
+    later: int = 0  # T and T0 belong to the filter with this delay in samples; the states of the delay come last
 
 
 def behind_delay(observer: LinearObserver, samples: int) -> LinearObserver:
-    """Return an observer whose rows come so many samples later, as states at the end of its own."""
+    """Return an observer with outputs delayed by this number of samples; the states of the delay come last."""
     for _ in range(samples):
         rows, order = observer.Cz.shape
         observer = replace(
@@ -48,7 +49,7 @@ def behind_delay(observer: LinearObserver, samples: int) -> LinearObserver:
 
 
 def before_delay(observer: LinearObserver, samples: int) -> LinearObserver:
-    """Return the observer that another one delays by so many samples: see `behind_delay`."""
+    """Return the observer without the delay that `behind_delay` added."""
     for _ in range(samples):
         own = observer.order - len(observer.Cz)
         observer = replace(
@@ -63,7 +64,7 @@ def before_delay(observer: LinearObserver, samples: int) -> LinearObserver:
     return observer
 
 
-def error_model_of(plant: DescriptorSystem, observer: LinearObserver, found: Followed) -> ErrorModel:
-    """Return what a shipped observer follows: of outputs that show inputs of later samples, by rows that are later."""
+def error_model_of(plant: DescriptorSystem, observer: LinearObserver, found: RealisedFilter) -> ErrorModel:
+    """Return the error system of a shipped observer; outputs that depend on later inputs are delayed first."""
     whole = behind_delay(observer, found.later)
     return ErrorModel(plant, whole, found.T, -found.T0, lag=found.lag, decoupled=True, later=found.later)
