@@ -13,10 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.sparse import csr_array
 
 from obsynth.methods.functional_filter.kalman_gain import FilterModel
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import rank_from, rounding_rank
+from obsynth.numerics.sparse_factor import residual_in_twice_the_digits
 from obsynth.numerics.spectra import abscissa
 
 #: Plants of fewer states are served by the filter of least noise, which then takes seconds.
@@ -68,14 +70,23 @@ def relation_model(model: FilterModel, seconds: float) -> FilterModel | None:
     if not np.isfinite(size) or size == 0.0:
         return None
     w = (best / size @ relations).reshape(s + 1, p)
-    t, row = np.zeros((s, k)), np.zeros(k)
-    for i in range(s, 0, -1):
-        row = w[i] @ c + row @ a
-        t[i - 1] = row
+    # Small gains of large relations lose their digits: what is missed is taken away from the relation itself.
+    missed = _rows(w, a, c)[0]
+    w = w - np.linalg.lstsq(np.vstack(powers).T, missed, rcond=None)[0].reshape(s + 1, p)
+    missed, *t = _rows(w, a, c)
     terms = np.linalg.norm(w, axis=1) @ [largest_singular_value(power) for power in powers]
-    if float(np.linalg.norm(w[0] @ c + row @ a)) > MOST_MISSED * float(terms):
+    if float(np.linalg.norm(missed)) > MOST_MISSED * float(terms):
         return None
-    return _chain(model, t, w, f, g)
+    return _chain(model, np.array(t), w, f, g)
+
+
+def _rows(w: FloatArray, a: FloatArray, c: FloatArray) -> FloatArray:
+    """Return the rows ``t_0 .. t_s`` of a relation ``w (s + 1, p)``, each sum rounded once."""
+    negative = csr_array(-np.vstack([c, a]).T)
+    rows, none = np.zeros((len(w) + 1, len(a))), np.zeros((len(a), 1))
+    for i in range(len(w) - 1, -1, -1):
+        rows[i] = residual_in_twice_the_digits(negative, np.concatenate([w[i], rows[i + 1]])[:, None], none)[:, 0]
+    return rows[:-1]
 
 
 def _responses(
