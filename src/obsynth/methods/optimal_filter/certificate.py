@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from obsynth.errors import SolverError
+from obsynth.methods.optimal_filter.checks import DEVIATION_SHARE
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, Designed, designed
 from obsynth.methods.optimal_filter.realised_filter import RealisedFilter, error_model_of
@@ -112,6 +113,11 @@ def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str,
     if chosen.is_nothing and ZERO_GAIN * channel.size < own <= chosen.nothing:
         # Noise that the filter reads by rounding only: small beside what it estimates, not beside what it reads.
         return {"deviation": own, "least_deviation": 0.0}
+    if gain and own > channel.rounding and not abs(own - gain) <= DEVIATION_SHARE * gain:
+        raise SolverError(
+            f"A deviation of {gain:.6g} was found, and that of the filter's stored numbers is {own:.6g}: the result is "
+            "inconclusive. Scale the plant's signals, or give every sensor noise."
+        )
     least = gain if chosen.is_nothing or chosen.least is None else chosen.least
     return {"deviation": max(gain, own) if gain and own <= channel.rounding else gain, "least_deviation": least}
 
