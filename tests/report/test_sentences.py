@@ -309,3 +309,23 @@ def test_a_bound_below_the_least_of_tests_is_not_called_a_part_of_an_optimum() -
     assert "less than any test with its delay on at most 32 samples of inputs and outputs has (0.75 W)" in longer
     assert "times" not in longer
     assert "2.00 times the optimum of all tests" in in_words("f1", 1.5, 0.75, "W", samples=32)
+
+
+@pytest.mark.parametrize("width", [80, 74, 70])
+def test_the_table_of_faults_keeps_names_on_one_line_where_all_columns_fit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], width: int
+) -> None:
+    """In 80 columns 'tm GENROU 1' stood on two lines; kept at any width it would cut off the last column."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main(["check", "--system", str(DESIGNS / "kundur" / "spec.yaml")]) == 0
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert len([line for line in lines if line.endswith(" 39")]) == 4
+    assert any(line.startswith("tm GENROU 1  ") for line in lines) == (width == 80)
+
+
+def test_cases_of_a_sweep_are_numbered_by_whole_numbers() -> None:
+    """A claim of one case of two was drawn at 1.00 between 0.96 and 1.04, without a place for the other."""
+    specs = [str(DESIGNS / name / "spec.yaml") for name in ("threetank", "filasova")]
+    axes = obsynth.sweep(specs).plot("index").axes[0]
+    assert axes.get_xlim() == (0.5, 2.5)
+    assert [tick for tick in axes.get_xticks() if 0.5 <= tick <= 2.5] == [1.0, 2.0]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -167,19 +168,19 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
     """Print the verdicts on all faults with their sentences; with ``everything`` isolability and residuals as well."""
     if not diagnosis.faults:
         return
-    print_section(console, diagnosis.heading, _rich_table(diagnosis.verdict_rows()))
+    print_section(console, diagnosis.heading, _rich_table(diagnosis.verdict_rows(), console))
     console.print(Text(_COLUMN_MEANINGS, style="dim"))
     if everything and len(diagnosis.faults) > 1:
         rows = diagnosis.bank_rows()
         print_section(
             console,
             "Isolability: which fault (row) can be distinguished from which (column)",
-            _rich_table(diagnosis.isolability_rows()),
+            _rich_table(diagnosis.isolability_rows(), console),
         )
         more = len(rows) - 1 - MOST_BANK_ROWS
         title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
         if len(rows) > 1:
-            print_section(console, title, _rich_table(rows[: MOST_BANK_ROWS + 1]))
+            print_section(console, title, _rich_table(rows[: MOST_BANK_ROWS + 1], console))
     for sentence in diagnosis.sentences:
         console.print(Text(sentence))
     for warning in diagnosis.warnings:
@@ -188,7 +189,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
         console.print()
 
 
-def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
+def _rich_table(rows: Sequence[Sequence[str]], console: Console) -> Table:
     table = headed_table(*rows[0])
     for column, (heading, *cells) in zip(table.columns, zip(*rows, strict=True), strict=True):
         column.overflow = "fold"
@@ -196,6 +197,12 @@ def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
         column.no_wrap = " " not in heading and all(len(cell) <= len(heading) for cell in cells)
     for row in rows[1:]:
         table.add_row(*(Text(text) for text in row))
+    # Names stay on one line where the other columns still fit beside them. A table's least width counts longest words,
+    # which rich misses by up to a letter a column.
+    names = [row[0] for row in rows]
+    added = max(map(len, names)) - max(len(word) for name in names for word in name.split())
+    least = Measurement.get(console, console.options, table).minimum
+    table.columns[0].no_wrap = least + added + len(table.columns) <= console.width
     return table
 
 

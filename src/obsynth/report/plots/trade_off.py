@@ -268,14 +268,24 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
         panel.set_yscale("log")
     if along is not None and _spread([place for points in lines.values() for place, _ in points]):
         panel.set_xscale("log")
-    panel.set_xlabel(
-        "case" if along is None else _claim_label(along, [result.facts.get("method", "") for result in results])
-    )
+    if along is None:
+        _number_cases(panel, len(results))
+    else:
+        panel.set_xlabel(_claim_label(along, [result.facts.get("method", "") for result in results]))
     panel.set_ylabel(_claim_label(claim, [result.facts.get("method", "") for result in results]))
     tidy(panel)
     if panel.get_legend_handles_labels()[1]:
         legend_above(panel)
     return figure
+
+
+def _number_cases(panel: Axes, count: int) -> None:
+    """Mark the cases by whole numbers and leave space for all of them, also for those without the claim."""
+    from matplotlib.ticker import MaxNLocator
+
+    panel.set_xlim(0.5, count + 0.5)
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    panel.set_xlabel("case (row of the table)")
 
 
 def _claim(results: Sequence[Any], claim: str | None, along: str | None) -> str:
