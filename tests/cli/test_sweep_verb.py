@@ -157,3 +157,14 @@ def test_the_table_on_a_narrow_terminal_cuts_nothing_and_says_what_it_leaves_out
     missing = told.partition("In table.csv alone: ")[2].partition(".")[0].split(", ")
     assert missing
     assert set(missing) < set(header)
+
+
+def test_headings_are_words_and_columns_of_the_file_are_names(spec, tmp_path, capsys, monkeypatch):
+    """An identifier ('gamma_margin') stood in the heading of the printed table."""
+    monkeypatch.setenv("COLUMNS", "100")
+    out = tmp_path / "s"
+    assert main(["sweep", "--system", spec, "--set", "gamma_margin=[0.05, 0.1]", "--out", str(out)]) == 0
+    heading = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("case "))
+    assert "margin" in heading
+    assert "_" not in heading
+    assert "gamma_margin" in next(csv.reader((out / "table.csv").read_text().splitlines()))

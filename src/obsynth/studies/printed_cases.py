@@ -52,7 +52,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
     for name, column in filled.items():
         if name not in same:
             # Texts fold at blanks, so a column needs the width of its longest word; a cut number would be wrong.
-            words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
+            words = [word for text in (_heading(name), *column) for word in text.split()]
             wide = max(map(len, words)) + _BLANKS_BETWEEN
             if wide <= room:
                 printed[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
@@ -63,7 +63,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
         lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
     if missing:
         lines.append(f"In {rest} alone: {', '.join(missing)}.")
-    table = headed_table(*(name.replace(".", ". ") for name in printed))
+    table = headed_table(*map(_heading, printed))
     for place, (name, cells) in zip(table.columns, printed.items(), strict=True):
         # Remaining space goes to the first columns whose texts are longer.
         more = min(max(map(len, cells)) - widths[name], room)
@@ -71,3 +71,8 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
     for row in zip(*printed.values(), strict=True):
         table.add_row(*(Text(cell or "-") for cell in row))
     return Group(*map(Text, lines), Text(), table)
+
+
+def _heading(name: str) -> str:
+    """Return the name of a column in words, with blanks where it may fold; table.csv keeps the name itself."""
+    return name.replace(".", ". ").replace("_", " ")
