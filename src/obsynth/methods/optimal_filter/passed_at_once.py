@@ -1,9 +1,9 @@
 """Direct feedthrough of a continuous filter, corrected such that no white noise passes to the error.
 
-Of signals of ever higher frequency an output shows ``N v``, v all that drives the plant, and the error of an estimate
-``D y`` is ``(D N - M) v``, M the reference model at infinity.  A design has ``D N = M`` but for rounding, beside which
-D itself may be small: white noise then has no finite mean square.  The nearest D with ``D N = M`` is taken instead, and
-for T0, with ``T0 E = 0`` and ``C T E + D C = T0 A``, the one that has the digits of D.
+At infinite frequency the outputs are ``N v``, where v collects all signals that drive the plant, and the error of an
+estimate ``D y`` is ``(D N - M) v``, where M is the reference model at infinity.  A design satisfies ``D N = M`` except
+for rounding.  Any difference that is left makes the mean square under white noise infinite, so the nearest D with
+``D N = M`` is taken, and T0, with ``T0 E = 0`` and ``C T E + D C = T0 A``, is computed from that D.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def without_white_noise(plant: DescriptorSystem, fault_map: FaultMap, filters: l
 
 
 def _shown_at_once(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what outputs show of faults, disturbances and noise of infinite frequency; the index is at most 1.
+    """Return the gains at infinite frequency from faults, disturbances and noise to the outputs (index at most 1).
 
-    Nothing but rounding of a signal would count as much as others, which are corrected in units of their own.
+    Gains that are rounding errors are set to zero: each signal is scaled by its own gain later.
     """
     answer = _answer(plant)
     answered, size = plant.C @ answer, np.abs(plant.C) @ np.abs(answer)
@@ -83,10 +83,10 @@ def with_digits_of(plant: DescriptorSystem, fault_map: FaultMap, follower: Reali
 
 
 def _without_rounding_passed(plant: DescriptorSystem, fault_map: FaultMap, follower: RealisedFilter) -> RealisedFilter:
-    """Return a filter whose D and T0, changed by rounding of each entry, pass at once what the fault map passes.
+    """Return a filter with the direct feedthrough of its fault map, by changes of D and T0 within their rounding.
 
-    Of an index of 2 or more what passes by the states hangs on T, too: ``D Dw - T0 Bw`` is what is stored of it.  Of
-    index 1 a T0 that cancels but for the digits that D has lost is nothing.
+    With an index of 2 or more the feedthrough by the states depends on T as well; the part that D and T0 determine is
+    ``D Dw - T0 Bw``.  With index 1, a T0 that is zero up to the digits lost in D is set to zero.
     """
     kernel = left_kernel_of(plant.E)
     weights, reference, none = fault_map.weights, fault_map.reference, np.zeros((len(follower.D), plant.nd))
