@@ -174,10 +174,11 @@ class TestJson:
         ("text", "message"),
         [
             ("NaN", "NaN is not allowed"), ("[-Infinity]", "is not allowed"), ("1" + "0" * 400, "401 digits"),
+            ("1e999", "1e999 is beyond"), ("-1E+0400", "beyond"), ("1" * 400 + ".0", r"1\.\.\. is beyond"),
             ("9" * 5000, "digits"), ('{"a": 1, "b": 2, "a": 3}', "'a' is there twice"), ('"\\ud800"', "surrogates"),
             ("[" * 100_000, "recursion"), ("{", "Expecting"), ("", "Expecting"),
         ],
-        ids=range(9),
+        ids=range(12),
     )  # fmt: skip
     def test_what_is_refused(self, text, message, tmp_path):
         written("a.json", text)
@@ -185,8 +186,8 @@ class TestJson:
             read_json(tmp_path / "a.json")
 
     def test_what_is_read(self, tmp_path):
-        written("a.json", '\ufeff{"a": [1, -2.5e-3, null, true, "\\ud83d\\ude00"]}')
-        assert read_json(tmp_path / "a.json") == {"a": [1, -2.5e-3, None, True, "\U0001f600"]}
+        written("a.json", '\ufeff{"a": [1, -2.5e-3, 1e308, 1e-999, null, true, "\\ud83d\\ude00"]}')
+        assert read_json(tmp_path / "a.json") == {"a": [1, -2.5e-3, 1e308, 0.0, None, True, "\U0001f600"]}
 
     def test_too_large(self, tmp_path):
         written("a.json", "[" + "1," * 100 + "1]")

@@ -305,6 +305,20 @@ def test_figures_agree_to_rounding_and_no_further() -> None:
     assert differences({"a": 1.0}, true) == ["names"]
 
 
+@pytest.mark.parametrize("name", ["deviation", "rms", "bound", "least", "smallest_found", "threshold", "bias", "size"])
+def test_a_figure_in_small_units_is_compared_with_those_of_its_unit(name: str) -> None:
+    """Of a fault in farads figures are 1e-12 beside a horizon of 61 s, and a bound may be an exact zero."""
+    figures = {"fault": "leak", "half": 4.0, "horizon": 61.0, "peak": 1.0, "unknown_input_gain": 3e-28}
+    figures |= {"unknown_input_share": 2e-16, "deviation": 1e-12, "rms": 2e-12, "bias": 1e-14, "size": 5e-12}
+    figures |= {"threshold": 3e-12, "smallest_found": 4e-12, "bound": 6e-12, "least": 1e-28}
+    assert differences({**figures, name: 2.0 * figures[name] + 1e-13}, figures) == [name]
+    assert not differences({**figures, name: figures[name] * (1.0 + 1e-7)}, figures)
+    # What is rounding beside its own kind is the same on another processor.
+    rounded = {**figures, "unknown_input_gain": 9e-28, "unknown_input_share": 7e-16, "least": 4e-28}
+    assert not differences({**rounded, "peak": 1.0 - 1e-15}, figures)
+    assert differences({**figures, "unknown_input_gain": 1e-12}, figures) == ["unknown_input_gain"]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_content_fails_as_contents(files: dict[str, Path], tmp_path: Path, kind: str) -> None:
     for key, value in (("asked", {}), ("asked", None), ("result", {}), ("log", 3), ("statement", None)):

@@ -49,6 +49,12 @@ READING_ERRORS = (
 #: Half of a pair of characters, which no file can hold; as JSON writes it, and as text.
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
+#: What a number beyond the range of floats has: an exponent of three digits, or as many digits before its point.
+_PERHAPS_INFINITE = re.compile(r"\d[eE]\+?\d{3}|\d{300}")
+
+#: Of a number in a message so many digits are shown.
+MOST_SHOWN_DIGITS = 20
+
 #: What a path can be that is neither a file nor a folder.
 _SPECIAL = {
     stat.S_IFIFO: "a named pipe",
@@ -256,7 +262,14 @@ def read_json(
 
 def json_data(text: str) -> Any:
     """Return what a JSON text says; `ValueError` for NaN, numbers beyond the range of floats and repeated keys."""
-    return json.loads(text, parse_constant=_refused_constant, parse_int=_ranged_int, object_pairs_hook=_distinct_keys)
+    return json.loads(
+        text,
+        parse_constant=_refused_constant,
+        parse_int=_ranged_int,
+        # A function for every number takes as long as all the rest of a large file.
+        parse_float=_ranged_float if _PERHAPS_INFINITE.search(text) else None,
+        object_pairs_hook=_distinct_keys,
+    )
 
 
 def _refused_constant(name: str) -> float:
@@ -267,6 +280,14 @@ def _ranged_int(text: str) -> int:
     if math.isinf(float(text)):
         raise ValueError(f"a whole number of {len(text)} digits is too large")
     return int(text)
+
+
+def _ranged_float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        shown = text if len(text) <= MOST_SHOWN_DIGITS else f"{text[:MOST_SHOWN_DIGITS]}..."
+        raise ValueError(f"{shown} is beyond the range of floats")
+    return value
 
 
 def _distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -30,8 +30,15 @@ RESULT_VERSION = 1
 #: Digits of a digest that a sentence shows.
 SHOWN_DIGITS = 12
 
-#: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
+#: Figures that are found again agree to this share of themselves, or of the largest of their unit beside them.
 SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
+
+#: Figures of a fault's estimate that are without a unit, and those that have one together: seconds, the fault's own.
+SHARES = frozenset({"at_horizon", "peak", "relative_error", "unknown_input_share"})
+SAME_UNIT = (
+    frozenset({"detection_delay", "half", "horizon", "most"}),
+    frozenset({"bias", "bound", "deviation", "least", "rms", "size", "smallest_found", "threshold"}),
+)
 
 #: Bytes in which a file says its kind.
 _CERTIFICATE_HEAD_BYTES = 200
@@ -99,16 +106,26 @@ def differences(stored: Any, again: Any, where: str = "") -> list[str]:
         items = [(str(i + 1), before, after) for i, (before, after) in enumerate(zip(stored, again, strict=True))]
     else:
         return [] if _same_figure(stored, again, 0.0) else [where]
-    numbers = [abs(float(after)) for _, _, after in items if _is_figure(after)]
-    rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
+    figures = {name: abs(float(after)) for name, _, after in items if _is_figure(after) and abs(after) < float("inf")}
     wrong = []
     for name, before, after in items:
         place = f"{where}, {name}" if where else name
         if not _is_figure(after):
             wrong += differences(before, after, place)
-        elif not _same_figure(before, after, rounding):
+        elif not _same_figure(before, after, FIGURE_ROUNDING_SHARE * _size_beside(name, figures)):
             wrong.append(place)
     return wrong
+
+
+def _size_beside(name: str, figures: Mapping[str, float]) -> float:
+    """Return the size beside which a figure may be nothing but rounding: that of the figures of its unit."""
+    if name in SHARES:
+        return 1.0
+    if name == "unknown_input_gain" and figures.get("unknown_input_share"):
+        # What a share of one would be.
+        return figures[name] / figures["unknown_input_share"]
+    own = next((names for names in SAME_UNIT if name in names), figures.keys())
+    return max((size for other, size in figures.items() if other in own), default=0.0)
 
 
 def _is_figure(value: Any) -> bool:
