@@ -12,7 +12,7 @@ from rich.console import Console
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.studies.least_thresholds import design_beside_least, in_words
+from obsynth.studies.least_thresholds import design_beside_least, in_words, thresholds_beside_least
 from obsynth.studies.tables import comparison_report
 
 DRIVE = Path(__file__).parents[2] / "designs/drive/spec.yaml"
@@ -128,3 +128,15 @@ def test_the_bound_of_a_scenario_counts_disturbances_that_begin_after_the_observ
     largest = np.abs(design.observer.run(np.array(outputs)).faults).max()
     assert largest > 0.9
     assert bound >= largest
+
+
+def test_the_bound_counts_what_comes_after_the_steps_that_were_followed() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.95]], C=[[1.0]], Bf=[[1.0]], Dw=[[0.1]], dt=1.0)
+    radius, steps = 0.99, 1500
+    response = 0.1 * radius ** np.arange(steps)
+    impulses = np.stack([np.eye(1, steps)[0], response], axis=1)[:, None]
+    ((bound, _),) = thresholds_beside_least(plant, impulses, ["f1"], np.zeros(0), radius)
+    # Three deviations of noise at every sample; of the whole sum 2.8e-7 are left after these steps.
+    whole = 3.0 * 0.1 / (1.0 - radius)
+    assert 3.0 * response.sum() < whole * (1.0 - 2e-7)
+    assert bound == pytest.approx(whole, rel=1e-12)

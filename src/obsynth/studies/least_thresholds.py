@@ -30,7 +30,7 @@ SAME_RESPONSE = 1e-6
 #: printed, and for so many steps at most.
 DECAYED, MOST_RESPONSE_STEPS = 1e-12, 20_000
 
-#: No bound is known where the rest of a response is more than this share of it: less than the digits that are printed.
+#: No bound is known where the rest of a response, which is estimated, is more than this share of it.
 LARGEST_REST = 1e-6
 
 
@@ -57,13 +57,14 @@ def thresholds_beside_least(
     pairs = []
     for row, name in enumerate(faults):
         gains = np.abs(impulses[:, row]).sum(axis=0)
+        followed = float(gains[plant.nf :] @ sizes[plant.nf :])
+        rest = later * float(np.abs(impulses[-quarter:, row, plant.nf :]).sum(axis=0) @ sizes[plant.nf :])
         if moving is not None:
             gains[plant.nf : plant.nf + plant.nd] = moving[row]
         bound = float(gains[plant.nf :] @ sizes[plant.nf :])
-        if later * float(np.abs(impulses[-quarter:, row, plant.nf :]).sum(axis=0) @ sizes[plant.nf :]) > (
-            LARGEST_REST * bound
-        ):
-            bound = float("nan")
+        # What comes after the steps that were followed is a part of the bound.
+        share = rest / followed if followed > 0.0 else 0.0
+        bound = bound * (1.0 + share) if share <= LARGEST_REST else float("nan")
         response = impulses[:, row, plant.fault_names.index(name)]
         lag = int(np.argmax(np.abs(response) > SAME_RESPONSE))
         alone = (
