@@ -6,6 +6,7 @@ do to the terms, and, for gains that were printed to some decimals, against what
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,11 @@ ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 
 #: Identities whose columns are states.
 _OF_STATES = ("dynamics", "state estimate", "fault estimate", "residual")
+
+
+def are_residual_names(names: Sequence[str], outputs: Sequence[str]) -> bool:
+    """Whether residuals have the names of the outputs that they are of, or numbers where they are of combinations."""
+    return tuple(names) in (tuple(outputs), tuple(f"r{i + 1}" for i in range(len(names))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.proofs.vertex_inequalities import Vertex, Witness
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import claimed
+from obsynth.verification.claims import ORDER_TOLERANCE, claimed
 from obsynth.verification.identities import Identity, equality, worst
 from obsynth.verification.over_region import gain_row, share_signals, switching_row
 
@@ -80,10 +80,19 @@ def gain_rows(
     if decoupled is not None and decoupled.passed:
         yield decoupled
     elif "gamma_min" in claims:
+        least = claimed(claims, "gamma_min")
+        yield upper_bound_check(
+            "claimed gains",
+            "0 <= gamma_min <= gamma",
+            max(least - gamma, -least, 0.0) / gamma if gamma > 0.0 else np.nan,
+            ORDER_TOLERANCE,
+            source="certificate",
+            detail="the largest step backwards, as a share of gamma",
+        )
         yield information(
             "least gain",
             "the least gain that the inequalities at the vertices allow, as the solver found it",
-            claimed(claims, "gamma_min"),
+            least,
             source="certificate",
             status="assumed",
         )

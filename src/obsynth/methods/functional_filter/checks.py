@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -250,7 +251,31 @@ def _fits(design: ObserverDesign) -> bool:
         and (observer.state_names or observer.fault_names or observer.residual_names)
         and observer.dt == plant.dt
         and list(observer.fault_names) == list(design.options.get("faults") or [])
+        and _are_residual_names(design)
         and all(delay == _delay(design) for delay in observer.fault_delays)
+    )
+
+
+def _are_residual_names(design: ObserverDesign) -> bool:
+    """Whether residuals are numbered, for each set of faults anew where a name says for which: ``leak: r1``.
+
+    Names that would be there twice are numbered once more, in front."""
+    plant, observer = design.linear
+    counts: dict[str, int] = {}
+    for place, name in enumerate(observer.residual_names, 1):
+        plain = name.removeprefix(f"{place}: ")
+        label, _, own = plain.rpartition(": ")
+        counts[label] = counts.get(label, 0) + 1
+        is_numbered = own == f"r{counts[label]}" if plain == name else re.fullmatch(r"r[1-9]\d*", own)
+        if not is_numbered or not _is_of_names(label, plant.fault_names):
+            return False
+    return True
+
+
+def _is_of_names(text: str, names: Sequence[str]) -> bool:
+    """Whether a text is names one after the other, with a blank between."""
+    return not text or any(
+        text == name or (text.startswith(f"{name} ") and _is_of_names(text[len(name) + 1 :], names)) for name in names
     )
 
 

@@ -20,7 +20,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.fault_models import fault_model_row
-from obsynth.verification.identities import ALIKE, equality, relative_tolerance
+from obsynth.verification.identities import ALIKE, are_residual_names, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
@@ -98,4 +98,5 @@ def _fits(design: ObserverDesign) -> bool:
         and observer.order == plant.nx + order
         and all(getattr(observer, name) == getattr(plant, name) for name in ALIKE)
         and all(delay == 0 for delay in (*observer.state_delays, *observer.fault_delays))
+        and are_residual_names(observer.residual_names, plant.output_names)
     )

@@ -21,7 +21,7 @@ from obsynth.results.checks import Check, fitting_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
 from obsynth.verification.fault_models import fault_model_row
-from obsynth.verification.identities import EQUALITY_TOLERANCE, Residual, equality, worst
+from obsynth.verification.identities import EQUALITY_TOLERANCE, Residual, are_residual_names, equality, worst
 from obsynth.verification.over_region import (
     GAIN_WITNESSES,
     REGION_GAIN_ROW,
@@ -87,6 +87,7 @@ def _fits(plant: PolytopicSystem, observer: ScheduledObserver, matrices: Mapping
         and share_signals(plant, observer)
         and observer.effectiveness_is_one
         and observer.fault_names == plant.fault_names
+        and are_residual_names(observer.residual_names, plant.output_names)
         and not any((*observer.state_delays, *observer.fault_delays))
     )
 
