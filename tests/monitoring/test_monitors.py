@@ -531,6 +531,8 @@ def test_a_fault_that_stays_is_seen_while_it_stays(method: str, kind: str) -> No
         record = obsynth.simulate(design, scenario)
         watched = obsynth.monitor(design, scenario, kind)
         assert "of the fault estimates" in watched.statement
+        # Of one estimate chi-square has two degrees of freedom, not one for each sample of its window.
+        assert kind == "cusum" or watched.threshold[-1] < stats.chi2.isf(1e-8, 2)
         values = watched.watch(record.estimates).values
         passed = values > watched.threshold
         assert not passed[:500].any()

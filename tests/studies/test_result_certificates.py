@@ -317,6 +317,7 @@ def test_a_figure_in_small_units_is_compared_with_those_of_its_unit(name: str) -
     rounded = {**figures, "unknown_input_gain": 9e-28, "unknown_input_share": 7e-16, "least": 4e-28}
     assert not differences({**rounded, "peak": 1.0 - 1e-15}, figures)
     assert differences({**figures, "unknown_input_gain": 1e-12}, figures) == ["unknown_input_gain"]
+    assert differences({**figures, "unknown_input_share": 1e-6}, figures) == ["unknown_input_share"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
