@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 import obsynth as ob
 
-CASES = 300
+CASES = 500
 LIMIT = 240.0  # s
 #: Parts of a sample in which a course has one sign; samples of a record.
 PARTS, RECORD = 64, 24
