@@ -83,7 +83,7 @@ def nonlinear_region(
     undriven = goal == "decay" and noise is None
     step = 1.0 if undriven else real_number(sample_time, "sample_time", "the seconds between samples", above=0.0)
     chosen_faults = tuple(model.parameter_names if faults is None else faults)
-    conditions = region_conditions(model, region, chosen_faults)
+    conditions = region_conditions(model, region, chosen_faults, step)
     require_all(conditions)
     terms = nonlinear_terms(model, faults=chosen_faults)
     place = OperatingRegion.of(terms, region)

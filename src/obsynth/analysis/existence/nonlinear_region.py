@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.dae_structure import index_report
 from obsynth.analysis.existence.condition import Condition, up_to_failure
 from obsynth.analysis.existence.recursive import described_mode
 from obsynth.analysis.existence.statements import Evaluator
@@ -29,13 +30,17 @@ _SOURCE = "observer over a region"
 
 
 def region_conditions(
-    model: DAEModel, region: Mapping[str, Any] | None, faults: Sequence[str]
+    model: DAEModel, region: Mapping[str, Any] | None, faults: Sequence[str], dt: float | None
 ) -> tuple[Condition, ...]:
-    """Return the conditions of an observer over a region; the list ends at the first failure."""
-    return up_to_failure(_in_order(model, region, faults))
+    """Return the conditions of an observer over a region; the list ends at the first failure.
+
+    ``dt``: seconds between samples, where they are stated."""
+    return up_to_failure(_in_order(model, region, faults, dt))
 
 
-def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequence[str]) -> Iterator[Condition]:
+def _in_order(
+    model: DAEModel, region: Mapping[str, Any] | None, faults: Sequence[str], dt: float | None
+) -> Iterator[Condition]:
     """Yield the conditions, each for a plant that meets those before it."""
     form = "E is constant, its derivatives are independent, and no formula jumps"
     try:
@@ -43,6 +48,17 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
     except PreconditionError as error:
         yield _of_the_form(error.condition or "form", form, str(error), signals=error.signals)
         return
+    if dt is not None:
+        report = index_report(model, dt)
+        if report.index > 1:
+            text = (
+                f"index {report.index} at the nominal values, because of the equations "
+                f"{', '.join(map(repr, report.equations))}, which do not determine "
+                f"{', '.join(map(repr, report.states))}: write the plant in coordinates that meet the constraint by "
+                "themselves, such as the angle of a rod in place of the coordinates of its end and its force"
+            )
+            yield _of_the_form("index", "the plant has index 1", text, value=float(report.index), signals=report.states)
+            return
     count = len(terms.nonlinearities)
     yield _of_the_form(
         "constant E",

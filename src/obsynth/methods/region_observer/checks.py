@@ -60,7 +60,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         source="options",
     )
     yield listed_gains(design, {"L": observer.gain})
-    conditions = region_conditions(plant, observer.region, observer.faults)
+    conditions = region_conditions(plant, observer.region, observer.faults, observer.dt)
     yield from condition_rows(conditions)
     if not all(condition.holds for condition in conditions):
         return

@@ -163,7 +163,7 @@ class RegionObserverMethod(Method):
         """Return the existence conditions; the list ends at the first failure."""
         from obsynth.analysis.existence.nonlinear_region import region_conditions
 
-        return region_conditions(plant, self.region, self.fault_names(plant))
+        return region_conditions(plant, self.region, self.fault_names(plant), self.sample_time)
 
     @classmethod
     def requested_limits(cls, design: ObserverDesign) -> Limits:
