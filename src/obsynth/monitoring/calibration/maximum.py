@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.monitoring.calibration.logs import refused
 from obsynth.monitoring.calibration.problem import CalibrationProblem
-from obsynth.monitoring.calibration.simulation_error import BoolArray, Fit
+from obsynth.monitoring.calibration.simulation_error import BoolArray, Fit, without_solution
 from obsynth.numerics.arrays import FloatArray
 
 #: Where the search for the variances begins: process noise and sensor noise as logarithms of factors of a first guess.
@@ -227,7 +227,8 @@ def greatest_likelihood(
     if best is None or value >= IMPOSSIBLE:
         raise refused(
             "cannot-simulate",
-            "The filter has no finite likelihood from any start: check units, bounds and the initial covariance.",
+            "The filter has no finite likelihood from any start."
+            f"{without_solution(objective.problem)} Check units, bounds and the initial covariance.",
             signals=list(objective.problem.unknown),
         )
     for _ in range(MOST_WIDENINGS):

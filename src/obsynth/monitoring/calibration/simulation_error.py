@@ -173,8 +173,8 @@ def simulation_fits(
     if not fits:
         raise refused(
             "cannot-simulate",
-            "No start gives a trajectory: the model has no solution along the log's inputs. Check "
-            "units, the sample time and the initial state, and narrow the bounds.",
+            "No start gives a trajectory: the model has no solution along the log's inputs."
+            f"{without_solution(problem)} Check units, the sample time and the initial state, and narrow the bounds.",
             signals=list(problem.unknown),
         )
     fits.sort(key=lambda fit: fit.cost)
@@ -183,6 +183,23 @@ def simulation_fits(
     _require_explained(problem, fits[0].deviations, judged, simulated)
     _require_levels(problem, fits[0], simulated, judged)
     return fits
+
+
+def without_solution(problem: CalibrationProblem) -> str:
+    """Return in words, after a blank, at which row the step of a simulation with the nominal constants has no solution,
+    and what may have one; empty where all steps have."""
+    error = SimulationError(problem)
+    start = np.concatenate([problem.nominal / problem.widths, problem.x0 / error.spread])
+    lost = np.flatnonzero(~np.isfinite(error.simulated(start)[0]).all(axis=1))
+    if not len(lost):
+        return ""
+    row, log = int(lost[0]), problem.log
+    shorter = "integration: radau or substeps: 10" if problem.integration != "radau" else "substeps: 10"
+    values = ", ".join(f"{name} = {value:.4g}" for name, value in zip(problem.unknown, problem.nominal, strict=True))
+    return (
+        f" With {values} the step of {log.dt:.4g} s to row {log.rows[0] + row} (at {log.time[row]:.6g} s) has none, as "
+        f"where a reaction ignites within a step: {shorter} may have one."
+    )
 
 
 def with_observed_start(
