@@ -147,3 +147,46 @@ def test_kelvin_in_a_header_above_degrees_is_told():
     expected = obsynth.run_on_data(cold, pd.DataFrame(own, columns=["time", "wall", "air"])).table
     found = obsynth.run_on_data(cold, data, scales={"wall": 1.0}).table
     np.testing.assert_allclose(found["fhat[f1]"], expected["fhat[f1]"], atol=1e-9)
+
+
+@with_pint
+@pytest.mark.parametrize(("header", "factor"), [("power (kW),wall,air", 1.0), ("power [kW],wall,air", 1e-6)])
+def test_validate_reads_the_unit_in_a_header_before_it_advises_a_factor(header, factor):
+    """A stated factor stands instead of the header's unit: 0.001 was advised, with which watts were milliwatts."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [1e-4]], C=np.eye(2), Bf=[[1], [0]], dt=1.0,
+        input_names=["power"], output_names=["wall", "air"], units={"power": "W", "wall": "degC", "air": "degC"},
+        operating_point={"power": 5000.0, "wall": 20.0, "air": 20.0}, sensor_noise={"wall": 0.1, "air": 0.1},
+    )  # fmt: skip
+    heated, rng, x, rows = obsynth.ui_pi_observer(plant), np.random.default_rng(3), np.zeros(2), []
+    for k in range(300):
+        power = 1000.0 * np.sin(k / 15.0)
+        rows.append([k, factor * (5000.0 + power), *(20.0 + x + 0.1 * rng.standard_normal(2))])
+        x = np.array([0.9 * x[0] + 0.1 * x[1], 0.8 * x[1] + 1e-4 * power])
+    data = pd.DataFrame(rows, columns=["time", *header.split(",")])
+    told = str(obsynth.validate(heated, data))
+    assert f"scales={{'power': {1.0 / factor:.15g}}}" in told
+    assert ("its header says kW, and the values are in W already" in told) == (factor == 1.0)
+    read = str(obsynth.validate(heated, data, scales={"power": 1.0 / factor}))
+    assert "scales=" not in read
+
+
+@with_pint
+def test_validate_tells_a_wrong_unit_of_a_nonlinear_plant_as_a_run_does():
+    """It said that Q was thousands of times too small."""
+    model = obsynth.DAEModel(
+        {"room": "2e5 * der(a) = power + 200 * (5.0 - a)"}, {"air": "a"}, states={"a": 20.0},
+        inputs={"power": 3000.0}, units={"power": "W", "air": "degC"},
+    )  # fmt: skip
+    heated = obsynth.dae_adaptive_observer(model, dt=60.0, Q={"room": 100.0}, R={"air": 0.01})
+    rng, a, rows = np.random.default_rng(3), 20.0, []
+    for k in range(300):
+        power = 3000.0 + 1500.0 * np.sin(k / 15.0)
+        rows.append([60.0 * k, power, a + 0.1 * rng.standard_normal()])
+        for _ in range(10):
+            a += 6.0 * (power + 200.0 * (5.0 - a)) / 2e5
+    data = pd.DataFrame(rows, columns=["time", "power [kW]", "air"])
+    with pytest.raises(obsynth.SpecError, match="its header says kW, and the values are in W already"):
+        obsynth.run_on_data(heated, data)
+    told = str(obsynth.validate(heated, data))
+    assert "its header says kW, and the values are in W already" in told

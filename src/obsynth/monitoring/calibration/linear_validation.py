@@ -9,6 +9,7 @@ may be as far off as its states have been.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -94,7 +95,7 @@ def sentences_on_sizes(
 
 def sentences_on_units(design: ObserverDesign, log: RecordedLog) -> list[str]:
     """Return that a signal is likely in another unit, where the first rows of a log say so."""
-    signals = LogRun(design).signals
+    signals = replace(LogRun(design).signals, in_header=dict(log.header_units))
     units = UnitCheck(design, signals)
     explained = units.explanation(np.hstack([log.measured_inputs, log.y]) - signals.offset)
     return [] if explained is None else [f"{units.words(*explained)}."]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from obsynth.errors import PreconditionError, SpecError, counted
 from obsynth.monitoring.logs.clock import MOST_STALE, SORTED, unit_advice
 from obsynth.monitoring.logs.log_tables import log_table, parsed_rows
-from obsynth.monitoring.logs.signals import mapping_advice, time_advice
+from obsynth.monitoring.logs.signals import HeaderUnit, mapping_advice, time_advice
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -85,6 +85,7 @@ class RecordedLog:
     outliers: tuple[FloatArray, ...] = ()
     input_delay: int = 0  # rows by which the inputs are later than the data have them
     held: NDArray[np.bool_] | None = None  # ``(n, nu)``: inputs that were missing, and stand as they last were
+    header_units: Mapping[str, HeaderUnit] = field(default_factory=dict)  # those that signals were converted from
 
     @property
     def measured_inputs(self) -> FloatArray:
@@ -197,7 +198,8 @@ def read_log(
             )
     held = {name: (columns or {}).get(name, name) for name in signals}
     own = {held[name]: unit for name, unit in units.items() if name in held and name not in (scales or {})}
-    table, names, source, notes = _table(log, list(held.values()), own)
+    in_header = dict[str, HeaderUnit]()
+    table, names, source, notes = _table(log, list(held.values()), own, in_header)
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
@@ -227,17 +229,18 @@ def read_log(
         name: [(first + begins, first + ends) for begins, ends in stuck_rows(values)]
         for name, values in zip(record.output_names, record.y.T, strict=True)
     }
-    return replace(record, notes=(*notes, *record.notes, *stuck_texts(stuck)))
+    converted = {name: in_header[wanted] for name, wanted in held.items() if wanted in in_header}
+    return replace(record, notes=(*notes, *record.notes, *stuck_texts(stuck)), header_units=converted)
 
 
 def _table(
-    log: Any, wanted: Sequence[str], units: Mapping[str, str]
+    log: Any, wanted: Sequence[str], units: Mapping[str, str], in_header: dict[str, HeaderUnit]
 ) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
     """Return columns that are wanted, the time first, names of all columns, where they come from, and what is to be
-    said of their cells."""
+    said of their cells; ``in_header`` is filled with the units that a header states of columns."""
     log = log if isinstance(log, str | Path | Mapping) else as_frame(log)
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
-        columns, names, notes = log_table(log, wanted[1:], wanted[0], units=units)
+        columns, names, notes = log_table(log, wanted[1:], wanted[0], units=units, in_header=in_header)
         return columns, names, Path(log).name if isinstance(log, str | Path) else "", notes
     if isinstance(log, Mapping):
         columns = {str(name): np.atleast_1d(np.asarray(log[name])) for name in log}
@@ -249,7 +252,8 @@ def _table(
             import pandas as pd
 
             # Cells with words are read as those of a frame.
-            read, _, notes = log_table(pd.DataFrame(wanted_columns), wanted[1:], wanted[0], units=units)
+            frame = pd.DataFrame(wanted_columns)
+            read, _, notes = log_table(frame, wanted[1:], wanted[0], units=units, in_header=in_header)
             return {**columns, **read}, list(map(str, log)), "", notes
         return columns, list(map(str, log)), "", ()
     raise SpecError(

@@ -347,9 +347,9 @@ def validate(
     if explained is not None:
         sentences.append(_explained(explained, linear=linear))
     if linear:
-        # In another unit nothing else that innovations say has a meaning.
-        sizes = sentences_on_sizes(sensors, total, explained or ())
-        sentences = sentences_on_units(design, record_log) or [*sentences, *sizes]
+        sentences += sentences_on_sizes(sensors, total, explained or ())
+    # In another unit nothing else that innovations say has a meaning.
+    sentences = sentences_on_units(design, record_log) or sentences
     passed = total.holds and not sentences
     if not (passed or total.holds or ratios) and explained is None:
         far = "small" if total.value > total.high else "large"

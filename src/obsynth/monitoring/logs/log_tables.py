@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.monitoring.logs.binary_logs import READERS, read_by_package
-from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, column_of
+from obsynth.monitoring.logs.signals import TIME_HEADER, HeaderUnit, LogSignals, column_of
 from obsynth.monitoring.logs.sources import (
     CHUNK_ROWS,
     LOG_SUFFIXES,
@@ -38,10 +38,12 @@ def log_table(
     time: str = TIME_HEADER,
     *,
     units: Mapping[str, str] = MappingProxyType({}),
+    in_header: dict[str, HeaderUnit] | None = None,
 ) -> tuple[dict[str, FloatArray], list[str], tuple[str, ...]]:
     """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, the names of all
     columns, and what is to be said of the cells; ``data`` is the name of a file or a data frame, ``time`` the column of
-    the stamps, ``units`` those that columns are converted to from what the header says."""
+    the stamps, ``units`` those that columns are converted to from what the header says, with which ``in_header`` is
+    filled."""
     data = data if isinstance(data, str | Path) else as_frame(data)
     header = _header(data, [time, *names])
     present = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
@@ -55,6 +57,8 @@ def log_table(
     stamps = Stamps()
     stamps.are_missing = not has_stamps
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
+    if in_header is not None:
+        in_header.update(signals.in_header)
     columns, times = dict(zip(present, rows[:, 1:].T, strict=True)), rows[:, 0]
     if stamps.is_dated:
         # Seconds since 1970 in double precision have lost what is below a microsecond.
