@@ -70,7 +70,7 @@ class H2Filter(Method):
         disk = conditions.disk(0.0, self.radius)
         own += conditions.region(A1, P, disk, Y=Y, Cy=C1, margin=1e-9)  # P has its scale by (45)
         problem = paper.changed(constraints=own, drop=["(45)"], objective=cp.trace(Z))
-        problem.solve("CLARABEL", {})
+        problem.solve()
         design = problem.design()
         norm, radius = _norm_and_radius(plant, design)
         claims = {**design.certificate.claims, "h2_norm": (1 + ROOM) * norm, "radius": (1 + ROOM) * radius + ROOM}
