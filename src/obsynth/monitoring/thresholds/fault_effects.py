@@ -72,6 +72,14 @@ class EffectState(NamedTuple):
     earlier: EarlierChanges = EarlierChanges()  # changes that were named, and are subtracted from what came later
 
 
+class Seen(NamedTuple):
+    """What a row is predicted from and judged by, ``(m,)`` each: residuals and estimates that are there, and those of
+    them that count, as the others follow from the rows before."""
+
+    there: NDArray[np.bool_]
+    judged: NDArray[np.bool_]
+
+
 _NOTHING = read_only(np.zeros(0))
 
 #: The state where effects are not followed.
@@ -108,10 +116,11 @@ class FaultEffects(ABC):
         )  # fmt: skip
 
     def step(
-        self, state: EffectState, observation: Any, white: FloatArray, seen: NDArray[np.bool_] | None, *, counts: bool
+        self, state: EffectState, observation: Any, white: FloatArray, seen: Seen | None, share: float
     ) -> EffectState:
         """Return the state after a sample with the observer's ``observation``: its residuals are ``white (m,)``,
-        of which those that were ``seen (m,)`` are measured, or none (`None`)."""
+        of which those that were ``seen`` are measured, or none (`None`). Where these are cut to a ``share``, so are
+        the effects on them."""
         if isinstance(observation, DAERow) and observation.k == 0:
             return self.init()
         state = self._with_begin(self._ended(state) if state.quiet == HOLD else state)
@@ -122,7 +131,8 @@ class FaultEffects(ABC):
             error = error * followed[:, None, None]
             score, information, sums, count = state.score, state.information, state.sums, state.counts
             earlier = state.earlier
-            if counts and seen is not None:
+            if share > 0.0 and seen is not None:
+                added = share * added
                 counted = followed & (rows <= COUNTED)
                 earlier = earlier.moved(added, counted, white)
                 added = added * counted[:, None, None]
@@ -137,7 +147,7 @@ class FaultEffects(ABC):
 
     @abstractmethod
     def _moved(
-        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: Seen | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ``error`` and ``past`` after a sample, which is one of so many ``rows (b,)`` from each begin, and the
         effects on its white residuals ``(b, m, h)``."""
@@ -270,7 +280,7 @@ class FilterEffects(FaultEffects):
         error[nx + np.arange(nq), np.arange(nq)] = 1.0
 
     def _moved(
-        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: Seen | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         if not isinstance(observation, DAERow):
             return state.error, state.past, np.zeros((len(rows), self.model.channels, len(self.hypotheses)))
@@ -310,7 +320,7 @@ class LinearEffects(FaultEffects):
         pass
 
     def _moved(
-        self, state: EffectState, observation: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+        self, state: EffectState, observation: Any, rows: FloatArray, seen: Seen | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         places = np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)
         # Later on a jump has settled, and a drift goes on as it went.
@@ -334,10 +344,10 @@ class LinearEffects(FaultEffects):
                 steps[k] = read @ z + through
                 z = transition @ z + inputs
             parts += [steps, np.cumsum(steps, axis=0)]
-        responses = np.concatenate(parts, axis=2)
+        responses, whole = np.concatenate(parts, axis=2), Seen(*(np.ones(len(places), dtype=bool),) * 2)
         past, white = np.zeros((1, self.model.order, *responses.shape[1:])), []
         for row in responses:
-            past, added = _whitened(self.model, past, row[None], np.ones(len(places), dtype=bool))
+            past, added = _whitened(self.model, past, row[None], whole)
             white.append(added[0])
         return np.array(white)
 
@@ -370,23 +380,26 @@ def _gain(observation: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray
 
 
 def _whitened(
-    model: Autoregression, past: FloatArray, row: FloatArray, seen: NDArray[np.bool_] | None
+    model: Autoregression, past: FloatArray, row: FloatArray, seen: Seen | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return effects on the latest residuals ``(b, order, m, h)``, and on the white ones of this row ``(b, m, h)``.
     What was not seen is as the rest makes it most likely; without any, as it is predicted, and nothing is added."""
     predicted = np.einsum("jac,bjch->bah", model.A, past) if model.order else np.zeros_like(row)
-    if seen is None:
-        row = predicted
-    elif not seen.all():
-        precision = model.whitener.T @ model.whitener
-        regression = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)])
-        away = (row - predicted)[:, seen]
-        completed = predicted.copy()
-        completed[:, seen] = row[:, seen]
-        completed[:, ~seen] += regression @ away
-        row = completed
-    past_after = np.concatenate([row[:, None], past[:, :-1]], axis=1) if model.order else past
-    return past_after, np.asarray(model.whitener @ (row - predicted))
+    judged = predicted if seen is None else _completed(model, predicted, row, seen.judged)
+    kept = judged if seen is None else np.where(seen.there[:, None], row, judged)
+    past_after = np.concatenate([kept[:, None], past[:, :-1]], axis=1) if model.order else past
+    return past_after, np.asarray(model.whitener @ (judged - predicted))
+
+
+def _completed(model: Autoregression, predicted: FloatArray, row: FloatArray, judged: NDArray[np.bool_]) -> FloatArray:
+    """Return effects on a row ``(b, m, h)``, of which what is not ``judged (m,)`` is as the rest makes it likely."""
+    if judged.all():
+        return row
+    precision = model.whitener.T @ model.whitener
+    regression = np.linalg.solve(precision[np.ix_(~judged, ~judged)], -precision[np.ix_(~judged, judged)])
+    completed = np.where(judged[:, None], row, predicted)
+    completed[:, ~judged] += regression @ (row - predicted)[:, judged]
+    return completed
 
 
 def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[FloatArray, FloatArray]:

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
+from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, Seen, effects_of
 from obsynth.monitoring.thresholds.hypotheses import ranked_changes
 from obsynth.monitoring.thresholds.learned import FAULTS_SLOWER, FOLLOWED_ROWS, OWN_ROWS, LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
@@ -204,7 +203,7 @@ class LearnedRule(Rule):
     def _begun(self, state: LearnedState, sample: Sample, missing: int) -> LearnedState:
         """Return the state with the rows that are ``missing`` before a sample, and what is counted of it."""
         for _ in range(min(missing, max(AGES))):
-            state = self._added(state, None)
+            state, _ = self._added(state, None)
         follows_nothing = missing > 0 or state.last is None
         if follows_nothing and self._rests_on_the_past and not isinstance(sample.observation, Evidence):
             state = state._replace(waiting=self._model.order)
@@ -243,19 +242,19 @@ class LearnedRule(Rule):
         if row.values is None or not (
             row.complete or (kept and (row.counts or np.isfinite(row.values[self._places]).all()))
         ):
-            state = self._followed(self._added(state, None), sample.observation)
+            state = self._followed(self._added(state, None)[0], sample.observation)
             if self._rests_on_the_past and not row.varying:
                 state = state._replace(waiting=self._model.order)
             return state
         watched = row.values[self._places]
         filled = watched if row.evidence is None else np.where(np.isfinite(watched), watched, row.evidence)
-        seen = np.isfinite(watched) if row.complete or row.varying else None
-        return self._followed(
-            self._added(state, filled, row.most, row.evidence),
-            sample.observation,
-            seen,
-            counts=row.counts and row.most > 0.0,
-        )
+        seen = None
+        if row.complete or row.varying:
+            is_there = np.isfinite(watched)
+            seen = Seen(is_there, is_there if row.complete else is_there & self._residual)
+        state, share = self._added(state, filled, row.most, row.evidence)
+        counts = row.counts and row.most > 0.0
+        return self._followed(state, sample.observation, seen, share if counts else 0.0)
 
     def _decision(
         self, state: LearnedState, row: _Row, values: FloatArray, sample: Sample
@@ -289,14 +288,13 @@ class LearnedRule(Rule):
         return state, RuleOutput(largest, 1.0, fault, (), ranking)
 
     def _followed(
-        self, state: LearnedState, observation: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
+        self, state: LearnedState, observation: Any, seen: Seen | None = None, share: float = 0.0
     ) -> LearnedState:
-        """Return the state with the effects of faults and sensors on a row, of which so much was ``seen (m,)``."""
+        """Return the state with the effects of faults and sensors on a row, of which so much was ``seen``, and such a
+        ``share`` counts."""
         if self.effects is None:
             return state
-        return state._replace(
-            effects=self.effects.step(state.effects, observation, state.white[-1], seen, counts=counts)
-        )
+        return state._replace(effects=self.effects.step(state.effects, observation, state.white[-1], seen, share))
 
     def _raised(self, before: FloatArray, sample: Sample, missing: int) -> FloatArray:
         """Return how far inputs are beyond their ranges ``(ages, nu)`` with a sample, after some that are missing."""
@@ -448,15 +446,16 @@ class LearnedRule(Rule):
 
     def _added(
         self, state: LearnedState, x: FloatArray | None, most: float = 0.0, evidence: FloatArray | None = None
-    ) -> LearnedState:
+    ) -> tuple[LearnedState, float]:
         """Return the state after a row, or after one that is as predicted (`None`): of a norm of ``most`` at most, with
-        its values as ``evidence`` (``(m,)``, by default the row itself)."""
+        its values as ``evidence`` (``(m,)``, by default the row itself); and the share of it that is left."""
         model, predicted = self._model, self._predicted(state)
         evidence = x if evidence is None else evidence
         with np.errstate(over="ignore", invalid="ignore"):
             e = np.zeros(model.channels) if evidence is None or not most else model.whitener @ (evidence - predicted)
             size = float(np.linalg.norm(e))
-            e = e * (most / size) if size > most else e
+            share = most / size if size > most else 1.0
+            e = e * share
         slow = state.slow
         if self._has_offset and evidence is not None and most:
             e = e - slow
@@ -465,7 +464,7 @@ class LearnedRule(Rule):
         shares = np.array(FORGETTING)[:, None]
         past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
         means = (1.0 - shares) * state.means + shares * e
-        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means, slow=slow)
+        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means, slow=slow), share
 
     def restart(self, state: LearnedState, skipped: int = 0) -> LearnedState:
         """Keep everything: rows that are missing are predicted over."""
