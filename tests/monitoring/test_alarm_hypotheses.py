@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -263,6 +264,46 @@ def test_an_alarm_that_goes_on_under_another_name_says_so():
     names = [row[table[0].index("fault")] for row in table[1:]]
     assert names == ["leak", "sensor y; the alarm of leak still stands", "leak; the alarm of leak still stands", "leak"]
     assert [event.as_dict()["while_standing"] for event in events.events()] == ["", "leak", "leak", ""]
+
+
+def alarm_of(*rankings):
+    """Return the one alarm of rows with these rankings, each at less evidence than the one before."""
+    events = AlarmLog(["time"])
+    for row, ranked_row in enumerate(rankings, 1):
+        events.advance(0)
+        called = ranked_row.called(("leak", "worn"))
+        events.take("learned", called, 10.0 / row, 10.0 * row, row, [0.0], distinguished=bool(called),
+                    ranking=ranked_row)  # fmt: skip
+    (event,) = events.events()
+    return event
+
+
+def test_what_was_as_likely_in_the_first_row_is_told_apart_by_later_rows():
+    """The jump of a sensor was called by the fault of the plant that explained the first row as well, as evidence is
+    largest there."""
+    tied, told = ranking(40.0, 5.0, 45.0), ranking(40.0, 5.0, 90.0)
+    event = alarm_of(tied, tied, told, told)
+    assert (event.fault, event.ties, event.evidence) == ("sensor y", (), 10.0)
+    assert alarm_of(tied, told, tied).fault == "sensor y"
+    # Something else at less evidence takes no name away, and one fault of several that are left is none.
+    assert alarm_of(tied, ranking(5.0, 90.0, 3.0)).fault == "leak"
+    both = ranking(45.0, 44.0, 43.0)
+    assert alarm_of(both, ranking(45.0, 44.0, 3.0)).fault == ""
+    assert alarm_of(both, ranking(45.0, 60.0, 58.0)).candidates == ("worn", "sensor y")
+
+
+def test_another_order_of_the_faults_changes_no_answer():
+    """Of those that were exactly alike the first in order was named."""
+    faults, passed = ("worn", "pump", "leak"), np.ones(3, dtype=bool)
+    values = {"worn": 30.0, "pump": 30.0, "leak": 30.0}
+    found = {
+        ranked_changes(order, np.array([[values[name] for name in order]]), passed)
+        for order in itertools.permutations(faults)
+    }
+    assert len(found) == 1
+    ratios = dict(zip(JUMPS, (45.0, 45.0, 44.0), strict=True))
+    jumps = {ranking(*(ratios[jump] for jump in order), hypotheses=order) for order in itertools.permutations(JUMPS)}
+    assert len({(found.shares, found.named, found.ties) for found in jumps}) == 1
 
 
 def test_slow_changes_that_estimates_follow_are_ranked_by_their_own_likelihoods():

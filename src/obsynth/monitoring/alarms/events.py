@@ -86,7 +86,8 @@ class AlarmEvent:
     by : str
         The column, or the kind of the monitor, whose threshold is passed.
     fault : str
-        The fault that it points to, at the largest evidence at which one is named; empty where there is none.
+        The fault that it points to, at the largest evidence at which one is named, or where later rows tell it from
+        those that were as likely there; empty where there is none.
     start, end : float, seconds
         Times of the first and the last row above the threshold.
     first_row, last_row : int
@@ -227,6 +228,9 @@ class AlarmLog:
         # What explains an alarm that was shelved is reported, whatever it was called at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
+        # What was as likely as another is named once later rows tell them apart, also at less evidence.
+        if distinguished and earlier == self._earlier[by] and _is_narrower(before, ranking):
+            tells, naming = True, max(naming, self._named_by[by])
         size, low, high = self._size(fault, cells, ranking) if tells else size_before
         if tells:
             named = fault
@@ -286,6 +290,13 @@ class AlarmLog:
     def events(self) -> tuple[AlarmEvent, ...]:
         """Return all alarms, those that are not over too, by their start."""
         return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
+
+
+def _is_narrower(before: AlarmEvent | None, ranking: Ranking | None) -> bool:
+    """Whether a later row leaves fewer of those that an open alarm may be, and nothing else."""
+    if before is None or ranking is None or not before.ties:
+        return False
+    return {ranking.named, *ranking.ties} < set(before.candidates)
 
 
 def alarm_rows(

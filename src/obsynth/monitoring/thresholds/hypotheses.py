@@ -110,7 +110,11 @@ def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, f
     scale = ratio_scale(most)
     weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
     total = sum(weights.values())
-    shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda hypothesis: -hypothesis[1])
+    # Of those that are exactly alike the order says nothing: names decide, so that another order changes no answer.
+    shares = sorted(
+        ((name, weight / total) for name, weight in weights.items()),
+        key=lambda hypothesis: (-hypothesis[1], hypothesis[0]),
+    )
     near = [name for name, _ in shares if most - ratios[name] <= DISTINGUISHED * scale]
     near.sort(key=lambda name: (name == NONE_OF_THESE, name.startswith(SENSOR)))
     return tuple(shares), near
