@@ -82,7 +82,7 @@ def gain_rows(
     elif "gamma_min" in claims:
         least = claimed(claims, "gamma_min")
         yield upper_bound_check(
-            "claimed gains",
+            "claimed least gain",
             "0 <= gamma_min <= gamma",
             max(least - gamma, -least, 0.0) / gamma if gamma > 0.0 else np.nan,
             ORDER_TOLERANCE,
