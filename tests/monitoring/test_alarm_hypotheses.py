@@ -15,6 +15,7 @@ from obsynth.cli.main import main
 from obsynth.errors import SpecError
 from obsynth.monitoring.alarms.events import SHELVED_AFTER, AlarmLog, alarm_rows
 from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE
+from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR
 from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, ranked, ranked_changes
 
 ROWS, BEGIN = 900, 500
@@ -285,11 +286,21 @@ def test_what_was_as_likely_in_the_first_row_is_told_apart_by_later_rows():
     event = alarm_of(tied, tied, told, told)
     assert (event.fault, event.ties, event.evidence) == ("sensor y", (), 10.0)
     assert alarm_of(tied, told, tied).fault == "sensor y"
-    # Something else at less evidence takes no name away, and one fault of several that are left is none.
-    assert alarm_of(tied, ranking(5.0, 90.0, 3.0)).fault == "leak"
+    # One fault of several that are left is none.
     both = ranking(45.0, 44.0, 43.0)
     assert alarm_of(both, ranking(45.0, 44.0, 3.0)).fault == ""
     assert alarm_of(both, ranking(45.0, 60.0, 58.0)).candidates == ("worn", "sensor y")
+
+
+def test_more_rows_correct_the_name_that_the_first_one_gave():
+    """One row said that a fault of the plant was certain, all later ones a sensor; its evidence was the largest."""
+    first, later = ranking(90.0, 5.0, 3.0), ranking(40.0, 5.0, 300.0)
+    event = alarm_of(first, later, later)
+    assert (event.fault, event.ties, event.evidence) == ("sensor y", (), 10.0)
+    # What does not decide takes no name away, nor what comes once begins are no longer looked for.
+    assert alarm_of(first, ranking(40.0, 5.0, 45.0)).fault == "leak"
+    assert alarm_of(first, ranking(30.0, 5.0, 3.0, shift=200.0)).fault == "leak"
+    assert alarm_of(*[first] * LOOKED_FOR, later).fault == "leak"
 
 
 def test_another_order_of_the_faults_changes_no_answer():

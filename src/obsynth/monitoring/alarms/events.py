@@ -13,6 +13,7 @@ from typing import Any
 from obsynth.monitoring.logs.clock import OUT_OF_ORDER, REPEATED_STAMP
 from obsynth.monitoring.logs.log_observer import GAP, OUT, PARTIAL, RECOVERING, WARM_UP
 from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, SENSOR, Ranking
+from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.observers.estimates import BAND_WIDTH
@@ -87,7 +88,7 @@ class AlarmEvent:
         The column, or the kind of the monitor, whose threshold is passed.
     fault : str
         The fault that it points to, at the largest evidence at which one is named, or where later rows tell it from
-        those that were as likely there; empty where there is none.
+        those that were as likely there, or decide within the first 20 of an alarm; empty where there is none.
     start, end : float, seconds
         Times of the first and the last row above the threshold.
     first_row, last_row : int
@@ -228,8 +229,11 @@ class AlarmLog:
         # What explains an alarm that was shelved is reported, whatever it was called at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
-        # What was as likely as another is named once later rows tell them apart, also at less evidence.
-        if distinguished and earlier == self._earlier[by] and _is_narrower(before, ranking):
+        # What was as likely as another is named once later rows tell them apart, also at less evidence; and while
+        # begins are looked for, more rows say more of what began than one in which the statistic was larger.
+        is_better = _is_narrower(before, ranking) or (not is_later and _is_better_founded(before, ranking))
+        is_alike = earlier == self._earlier[by] and is_later >= self._named_by[by][0]
+        if distinguished and is_alike and is_better:
             tells, naming = True, max(naming, self._named_by[by])
         size, low, high = self._size(fault, cells, ranking) if tells else size_before
         if tells:
@@ -297,6 +301,13 @@ def _is_narrower(before: AlarmEvent | None, ranking: Ranking | None) -> bool:
     if before is None or ranking is None or not before.ties:
         return False
     return {ranking.named, *ranking.ties} < set(before.candidates)
+
+
+def _is_better_founded(before: AlarmEvent | None, ranking: Ranking | None) -> bool:
+    """Whether a later row of those in which the begin of an open alarm is looked for decides for one hypothesis."""
+    if before is None or ranking is None or not before.shares or before.rows >= LOOKED_FOR:
+        return False
+    return not ranking.ties and ranking.named != NONE_OF_THESE
 
 
 def alarm_rows(
