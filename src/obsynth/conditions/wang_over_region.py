@@ -17,8 +17,9 @@ from obsynth.analysis.existence.over_region import FilterOverRegion, examine_ove
 from obsynth.conditions.polytope import vertex_inequalities
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.injection_problem import null_basis
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.registered import registered
 from obsynth.verification.error_polytope import ErrorPolytope
@@ -63,10 +64,16 @@ def wang_over_region(plant: PolytopicSystem, *, gamma: float | None = None, marg
 
 
 def errors_over_region(parts: FilterOverRegion, W: FloatArray) -> tuple[ErrorPolytope, list[FloatArray], FloatArray]:
-    """Return the error system in R at each vertex, ``L0`` at each vertex, and U2: ``L = L0 + R U2'``."""
-    U2 = null_basis(parts.Upsilon.T)
+    """Return the error system in R at each vertex, ``L0`` at each vertex, and U2: ``L = L0 + R U2'``.
+
+    Combinations of outputs that show nothing, as of a sensor that repeats another, are not among those of U2: gains on
+    them are of any size, and change nothing but by rounding."""
     C, Dd, T, N = parts.work[0].C, parts.work[0].Dd, parts.T, parts.N
     output_part = (np.eye(len(C)) - C @ N) @ Dd
+    U2 = null_basis(parts.Upsilon.T)
+    shown = np.hstack([C, output_part])
+    directions, sizes, _ = np.linalg.svd(U2.T @ shown)
+    U2 = U2 @ directions[:, : np.count_nonzero(sizes > CANCELLATION_TOLERANCE * largest_singular_value(shown))]
     A1, B1, L0 = [], [], []
     for vertex in parts.work:
         TA = T @ vertex.A
