@@ -19,7 +19,7 @@ from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.injection_problem import null_basis
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.registered import registered
 from obsynth.verification.error_polytope import ErrorPolytope
@@ -69,17 +69,18 @@ def errors_over_region(parts: FilterOverRegion, W: FloatArray) -> tuple[ErrorPol
     Combinations of outputs that show nothing, as of a sensor that repeats another, are not among those of U2: gains on
     them are of any size, and change nothing but by rounding."""
     C, Dd, T, N = parts.work[0].C, parts.work[0].Dd, parts.T, parts.N
-    output_part = (np.eye(len(C)) - C @ N) @ Dd
+    output_part = product_but_rounding(-C @ N, Dd, Dd)
     U2 = null_basis(parts.Upsilon.T)
     shown = np.hstack([C, output_part])
     directions, sizes, _ = np.linalg.svd(U2.T @ shown)
     U2 = U2 @ directions[:, : np.count_nonzero(sizes > CANCELLATION_TOLERANCE * largest_singular_value(shown))]
     A1, B1, L0 = [], [], []
     for vertex in parts.work:
-        TA = T @ vertex.A
+        TA = product_but_rounding(T, vertex.A)
         first = TA @ parts.Psi @ W
         L0.append(first)
-        A1.append(TA - first @ C)
-        B1.append(T @ vertex.Bd - TA @ (N @ Dd) - first @ output_part)
-    errors = ErrorPolytope(A1, U2.T @ C, B=B1, D=U2.T @ output_part, Cz=W @ C, Dz=W @ output_part, dt=parts.work[0].dt)
-    return errors, L0, U2
+        A1.append(product_but_rounding(-first, C, TA))
+        B1.append(product_but_rounding(T, vertex.Bd) - np.hstack([TA @ N, first]) @ np.vstack([Dd, output_part]))
+    C1, D1 = product_but_rounding(U2.T, C), product_but_rounding(U2.T, output_part)
+    Cz, Dz = product_but_rounding(W, C), product_but_rounding(W, output_part)
+    return ErrorPolytope(A1, C1, B=B1, D=D1, Cz=Cz, Dz=Dz, dt=parts.work[0].dt), L0, U2

@@ -282,7 +282,7 @@ class _Search:
             # Try the best gain for this P first; a decay may need the solver's own gain instead.
             candidates = [[_best_gain(moved, inner.P[0], level / z_unit)], own]
         witness = units.witness_out(inner, z_unit)
-        V = problem.variables["V"].value * z_unit / units.outputs if "V" in problem.variables else None
+        V = problem.variables["V"].value * z_unit @ units.into_outputs if "V" in problem.variables else None
         whole = errors if V is None else errors.with_innovation(V)
         for each in candidates:
             made = self._shipped(each) if gains is None else [np.asarray(L, np.float64) for L in gains]
@@ -458,11 +458,7 @@ def _least(
 ) -> tuple[float, float, float]:
     """Return the least level, the unit of z in which it is near one, and what a level is about without any gain."""
     plain = units.moved(1.0)
-    sizes = [
-        np.linalg.norm(z) * np.linalg.norm(b) + np.linalg.norm(d)
-        for z, b, d in zip(plain.Cz, plain.B, plain.Dz, strict=True)
-    ]
-    size = float(max(sizes))
+    size = level_without_gains(plain)
     unit, known = power_of_two(size) if size > 0.0 else 1.0, None
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
@@ -486,6 +482,12 @@ def _least(
         known = level, unit, size
         unit *= power_of_two(least)
     return level, unit, size
+
+
+def level_without_gains(errors: ErrorPolytope) -> float:
+    """Return what a level is about without any gain: the largest ``|Cz| |B| + |Dz|`` of the vertices."""
+    vertices = zip(errors.Cz, errors.B, errors.Dz, strict=True)
+    return max(float(np.linalg.norm(z) * np.linalg.norm(b) + np.linalg.norm(d)) for z, b, d in vertices)
 
 
 def power_of_two(value: float) -> float:
@@ -512,11 +514,12 @@ def has_numbers(problem: Any, solver: str, settings: Mapping[str, Any] | None, r
 
 @dataclass(frozen=True, eq=False)
 class ErrorUnits:
-    """Powers of two for states and measurements, in which the vertices are balanced."""
+    """Powers of two for states, and coordinates of measurements, in which the vertices are balanced."""
 
     errors: ErrorPolytope
     states: FloatArray
-    outputs: FloatArray
+    into_outputs: FloatArray  # y' = into_outputs y
+    out_of_outputs: FloatArray  # its inverse
 
     @classmethod
     def of(cls, errors: ErrorPolytope) -> ErrorUnits:
@@ -524,7 +527,7 @@ class ErrorUnits:
         n, m = errors.order, errors.outputs
         if errors.ball or (errors.differential is not None and errors.differential < n):
             # A remainder is a norm in the given units; algebraic equations have rows of their own.
-            return cls(errors, np.ones(n), np.ones(m))
+            return cls(errors, np.ones(n), np.eye(m), np.eye(m))
         largest = [
             np.max([np.abs(matrix) for matrix in each], axis=0) for each in (errors.A, errors.B, errors.C, errors.Cz)
         ]
@@ -533,30 +536,38 @@ class ErrorUnits:
         # All states in a unit in which the inputs are near one: P is then as large as the level, whatever that is.
         driven = float(np.linalg.norm(b / states[:, None]))
         states = states * float(np.exp2(np.round(np.log2(driven)))) if driven > 0.0 else states
+        if errors.constant_output and m:
+            # Measurements that say nearly the same are combined to ones that say different things.
+            directions, sizes, _ = np.linalg.svd(np.hstack([errors.C[0] * states, errors.D[0]]), full_matrices=True)
+            sizes = np.concatenate([sizes, np.zeros(m - len(sizes))])
+            sizes = np.where(sizes > 0.0, sizes, 1.0)
+            return cls(errors, states, directions.T / sizes[:, None], directions * sizes)
         sizes = np.linalg.norm(c * states, axis=1)
         outputs = np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
-        return cls(errors, states, outputs)
+        return cls(errors, states, np.diag(1.0 / outputs), np.diag(outputs))
 
     def moved(self, level: float) -> ErrorPolytope:
         """Return the vertices in these units, z in units of ``level``."""
-        s, o = self.states, self.outputs[:, None]
+        s, o = self.states, self.into_outputs
         return replace(
             self.errors,
             A=[a * s / s[:, None] for a in self.errors.A],
             B=[b / s[:, None] for b in self.errors.B],
-            C=[c * s / o for c in self.errors.C],
-            D=[d / o for d in self.errors.D],
+            C=[o @ c * s for c in self.errors.C],
+            D=[o @ d for d in self.errors.D],
             Cz=[z * s / level for z in self.errors.Cz],
             Dz=[z / level for z in self.errors.Dz],
         )
 
     def gains_in(self, gains: Sequence[FloatArray] | None) -> list[FloatArray] | None:
         """Return gains in these units."""
-        return None if gains is None else [np.asarray(L) * self.outputs / self.states[:, None] for L in gains]
+        if gains is None:
+            return None
+        return [np.asarray(L) @ self.out_of_outputs / self.states[:, None] for L in gains]
 
     def gain_out(self, L: FloatArray) -> FloatArray:
         """Return a gain in the units of the plant."""
-        return L * self.states[:, None] / self.outputs
+        return np.asarray(L * self.states[:, None] @ self.into_outputs)
 
     def witness_out(self, witness: Witness, level: float) -> Witness:
         """Return Lyapunov matrices in the units of the plant: P of ``e = S e'``, z in units of ``level``, becomes

@@ -91,7 +91,7 @@ def gain_rows(
         )
         yield information(
             "least gain",
-            "the least gain that the inequalities at the vertices allow, as the solver found it",
+            "the least level that the search reached with the inequalities at the vertices; no lower bound of the gain",
             least,
             source="certificate",
             status="assumed",

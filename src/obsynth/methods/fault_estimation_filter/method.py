@@ -173,7 +173,8 @@ class FaultEstimationFilter(Method):
         ),
         "gamma_min": ClaimMeaning(
             "",
-            "smallest gamma for this T, N and W (free weight: T and N); proved where 'least gain' says so",
+            "smallest gamma for this T, N and W (free weight: T and N); proved where 'least gain' says so, else the "
+            "least that the search reached",
             "least gain",
             side="at least",
         ),

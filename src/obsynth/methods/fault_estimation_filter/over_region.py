@@ -20,8 +20,16 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.wang_over_region import errors_over_region
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.region_notes import by_product_notes, certificate_note, unused_rate_notes
-from obsynth.methods.engines.vertex_certificates import ROOMS, VertexCertificate, certified_for_steps
-from obsynth.methods.fault_estimation_filter.decoupled_gains import decoupling_of
+from obsynth.methods.engines.vertex_certificates import (
+    ROOMS,
+    ErrorUnits,
+    VertexCertificate,
+    certified_for_steps,
+    level_without_gains,
+    proved_decay,
+)
+from obsynth.methods.fault_estimation_filter.centred_errors import certified_when_centred
+from obsynth.methods.fault_estimation_filter.decoupled_gains import decoupling_of, witness_of_gain
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.fault_estimation_filter.turning_faults import synthesise_turning
@@ -30,10 +38,16 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.vertex_inequalities import prove_gain
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.over_region import rows_to_forget, stored_witness
 
+#: Gains of decoupled estimates that are proved, as shares of what the disturbances do without gains: the first that
+#: rounding allows.
+PROVABLE = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+#: A gain that is all but zero is better than one of zero where its errors are forgotten in fewer rows by this factor.
+MUCH_FASTER = 10
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
     "S", "constraints", "mean", "objective", "prove_least", "region", "residual_weight_limit",
@@ -57,10 +71,9 @@ def synthesise_over_region(
     steps = plant.scheduling.usable_step_of(plant.dt)
     progress("solving the inequalities at the vertices")
     certificate = _certified(errors, method, parts, steps)
-    decoupled = _decoupled(errors, method, parts) if certificate.is_negligible else None
+    decoupled = _decoupled(errors, method, parts)
     progress("building the realisation and its certificate")
-    # Where that is exact at the price of a slower decay, a gain that is all but zero is better.
-    if decoupled is not None and decoupled.decay <= certificate.decay:
+    if decoupled is not None and not (certificate.is_negligible and certificate.decay < decoupled.decay**MUCH_FASTER):
         return _synthesis(plant, method, parts, W, decoupled, None, decoupled=True)
     return _synthesis(plant, method, parts, W, certificate, steps)
 
@@ -74,12 +87,23 @@ def _decoupled(
         return None
     try:
         rest = _certified(made.errors, method, parts, None)
-        Z = rest.gains * (errors.count if len(rest.gains) == 1 else 1)
-        R = [r + z @ made.N.T for r, z in zip(made.R, Z, strict=True)]
-        found = _certified(errors.with_innovation(made.V), method, parts, None, gains=R, margin=0.0)
     except SolverError:
         return None
-    return replace(found, output=made.V, runs=(*rest.runs, *found.runs), is_fastest=rest.is_fastest)
+    Z = rest.gains * (errors.count if len(rest.gains) == 1 else 1)
+    R = [r + z @ made.N.T for r, z in zip(made.R, Z, strict=True)]
+    whole, size = errors.with_innovation(made.V), level_without_gains(ErrorUnits.of(errors).moved(1.0))
+    levels = [share * size for share in PROVABLE] if method.gamma is None else [method.gamma / parts.reach]
+    for level in levels:
+        witness = witness_of_gain(whole, R, rest.witness.P[0], level)
+        if witness is None:
+            return None
+        proof = prove_gain(whole.closed(R), witness, level, discrete=True)
+        decay = proved_decay(whole, R, witness, required=rest.decay) if proof.proved else np.inf
+        if decay <= (1.0 if method.decay is None else float(np.exp(-method.decay * errors.dt))):
+            return replace(
+                rest, gains=R, witness=witness, level=level, least=0.0, decay=decay, proof=proof, output=made.V
+            )
+    return None
 
 
 def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synthesis:
@@ -117,7 +141,7 @@ def _synthesis(
     if plant.nd:
         claims |= {
             "gamma": certificate.gain_times(parts.reach),
-            "gamma_min": 0.0 if decoupled else certificate.least * parts.reach,
+            "gamma_min": certificate.least * parts.reach,
         }
     return Synthesis(
         options=method.as_plain(),
@@ -173,10 +197,14 @@ def _certified(
     }
     if not count or gains is not None or method.asks_for_free_weight is False or not errors.outputs:
         return certified_for_steps(work, **options)
+
+    def with_free_weight(centred: ErrorPolytope) -> VertexCertificate:
+        return certified_for_steps(centred, free_output=True, **options)
+
     if method.asks_for_free_weight:
-        return certified_for_steps(work, free_output=True, **options)
+        return certified_when_centred(work, with_free_weight)
     try:
-        free = certified_for_steps(work, free_output=True, **options)
+        free = certified_when_centred(work, with_free_weight)
     except SolverError:
         return certified_for_steps(work, **options)
     if level is not None or free.is_negligible or free.level <= (1.0 + ROOMS[-1] + options["margin"]) * free.least:
