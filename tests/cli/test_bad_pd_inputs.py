@@ -61,7 +61,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], int, tuple[str, ..
         {**BASE["plant"], "Bf": [[0, 0], [1, 0], [1, 0], [0, 0]], "fault_names": ["a", "b"]}, {}, 3, ("rank F", "'b'")),
     "an unobservable unstable mode": (HIDDEN_UNSTABLE, {}, 3, ("detectability", "s = 1", "'x2'")),
     "a zero at s = 0": (ZERO, {}, 3, ("rank [A F; C Df]", "s = 0", "'valve'")),
-    "index 2": (INDEX_2, {}, 3, ("index 2", "the output y1 needs the derivative of f1")),
+    "index 2": (INDEX_2, {}, 3, ("index 2", "the output 'y1' needs the derivative of 'f1'")),
     "not regular": (NOT_REGULAR, {}, 3, ("regularity",)),
     "algebraic alone": (ALGEBRAIC, {}, 3, ("dynamic states",)),
     # Proved impossible: 4.

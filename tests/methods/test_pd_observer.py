@@ -631,7 +631,7 @@ def test_white_noise_in_a_constraint_is_named_where_outputs_would_differentiate_
         C=[[1.0, 0.0, 1.5], [1.0, -1.5, 1.0]], Bf=[[1.0], [0.5], [0.0]], Bw=[[0.1], [0.0], [-0.1]], Dw=np.zeros((2, 1)),
     )  # fmt: skip
     with pytest.raises(
-        obsynth.PreconditionError, match=r"need the derivative of w1, white noise in a constraint\. Leave that"
+        obsynth.PreconditionError, match=r"need the derivative of 'w1', white noise in a constraint\. Leave that"
     ):
         obsynth.pd_observer(plant)
     assert obsynth.pd_observer(plant.replace(Bw=None, Dw=None, noise_names=None)).report.passed

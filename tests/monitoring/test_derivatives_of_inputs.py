@@ -57,7 +57,7 @@ def test_the_output_is_used_and_the_derivative_is_an_input_that_is_named(plant, 
     assert design.plant.input_names == ("u", "derivative of u")
     assert design.plant.output_names == ("y1", "y2")
     assert design.plant.units["derivative of u"] == "m/s"
-    assert any("y2 needs the derivative of u" in note and "by differences" in note for note in design.notes)
+    assert any("'y2' needs the derivative of 'u'" in note and "by differences" in note for note in design.notes)
     assert "derivative of u" in str(obsynth.check(plant)["ui-pi-observer"])
 
 

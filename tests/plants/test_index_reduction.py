@@ -130,7 +130,7 @@ def test_rounding_of_a_does_not_make_algebraic_equations_solvable():
             for kind in ("u", "f"):
                 np.testing.assert_allclose(transfer(reduced, s, kind), transfer(plant, s, kind), rtol=1e-6, atol=1e-6)
         plant, _ = rounded_sums(seed, proper=False)
-        with pytest.raises(obsynth.PreconditionError, match="later sample of f1"):
+        with pytest.raises(obsynth.PreconditionError, match="later sample of 'f1'"):
             obsynth.eliminate_algebraic_states(plant)
 
 
@@ -140,7 +140,7 @@ def test_an_output_that_needs_a_derivative_names_the_signal():
         E=np.diag([1.0, 1.0, 0.0]), A=[[0, 1, 0], [-2, -1, 1], [1, 0, 0]], C=[[0, 1, 0]], Bf=[[0], [0], [-1]],
         fault_names=["stroke"], output_names=["speed"],
     )  # fmt: skip
-    with pytest.raises(obsynth.PreconditionError, match="output speed needs the derivative of stroke") as caught:
+    with pytest.raises(obsynth.PreconditionError, match="output 'speed' needs the derivative of 'stroke'") as caught:
         obsynth.eliminate_algebraic_states(plant)
     assert caught.value.signals == ("speed", "stroke")
 
@@ -154,9 +154,9 @@ def test_an_output_that_needs_a_derivative_of_an_unknown_input_is_left_out_and_t
     )  # fmt: skip
     design = obsynth.pd_observer(plant)
     assert design.plant.output_names == ("sum",)
-    assert any("The output speed needs the derivative of stroke: it is left out" in note for note in design.notes)
+    assert any("The output 'speed' needs the derivative of 'stroke': it is left out" in note for note in design.notes)
     (row,) = (row for row in obsynth.check(plant)["pd-observer"].checks if row.name == "exists: proper form")
-    assert "speed needs the derivative of stroke" in row.detail
+    assert "'speed' needs the derivative of 'stroke'" in row.detail
     # This one takes the plant as it is.
     assert obsynth.functional_filter(plant).plant.output_names == ("speed", "sum")
 
@@ -243,7 +243,9 @@ def test_a_refusal_of_a_reduced_plant_names_what_was_left_out_and_states_as_writ
         Bf=[[0.0], [-1.0], [0.0]],
         fault_names=["leak"],
     )
-    with pytest.raises(obsynth.PreconditionError, match="y2 needs the derivative of leak: it is left out") as caught:
+    with pytest.raises(
+        obsynth.PreconditionError, match="'y2' needs the derivative of 'leak': it is left out"
+    ) as caught:
         obsynth.design(plant, method)
     assert "No observer of this kind exists" not in str(caught.value)
     assert caught.value.add == (("x1",),)

@@ -178,7 +178,7 @@ class TestIdleVariables:
         plant = obsynth.DescriptorSystem(
             make(self.E), make(self.A), C=[[1, 0, 0, 0], [0, 0, 0, 1]], Bf=[[0], [0], [1], [0]], output_names=["a", "b"]
         )
-        with pytest.raises(obsynth.PreconditionError, match="output b needs the derivative of f1") as caught:
+        with pytest.raises(obsynth.PreconditionError, match="output 'b' needs the derivative of 'f1'") as caught:
             obsynth.eliminate_algebraic_states(plant)
         assert caught.value.condition == "index"
         assert caught.value.signals == ("b", "f1")

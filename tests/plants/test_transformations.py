@@ -156,7 +156,7 @@ class TestElimination:
     def test_an_output_that_needs_a_derivative(self):
         E = block_diag(np.eye(2, k=1), [[1.0]])
         plant = DescriptorSystem(E, np.diag([1.0, 1, -1]), [[0.0], [1], [1]], C=[[1, 0, 0], [0, 1, 1]])
-        with pytest.raises(PreconditionError, match="output y1 needs the derivative of u1") as caught:
+        with pytest.raises(PreconditionError, match="output 'y1' needs the derivative of 'u1'") as caught:
             eliminate_algebraic_states(plant)
         assert caught.value.condition == "index"
         found = eliminate_algebraic_states(plant.replace(C=[[0, 1, 0], [0, 1, 1]]))

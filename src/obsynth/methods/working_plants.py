@@ -14,6 +14,7 @@ from obsynth.methods.method import Method
 from obsynth.methods.options_as_written import method_for_proper_form
 from obsynth.methods.registry import Plant
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
@@ -198,8 +199,8 @@ def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tu
     outputs, signals = improper_outputs(plant)
     one = len(outputs) == 1
     note = (
-        f"The output{'' if one else 's'} {', '.join(outputs)} need{'s' if one else ''} the derivative of "
-        f"{', '.join(signals)}: a run on a log forms {', '.join(map(repr, names))} by differences from row to row "
+        f"The output{'' if one else 's'} {quoted_names(outputs)} need{'s' if one else ''} the derivative of "
+        f"{quoted_names(signals)}: a run on a log forms {quoted_names(names)} by differences from row to row "
         "where the log has no column of that name; C code and FMUs take it as an input."
     )
     return transformation, (note,)
@@ -223,10 +224,10 @@ def _without_improper_outputs(plant: DescriptorSystem) -> tuple[Transformation |
         return None, ()
     rows = {name: getattr(plant, name)[proper_rows] for name in ("C", "D", "Df", "Dd", "Dw")}
     fewer = plant.replace(output_names=[plant.output_names[row] for row in proper_rows], **rows)
-    needs = f"a later sample of {', '.join(signals)}" if plant.dt else f"the derivative of {', '.join(signals)}"
+    needs = f"a later sample of {quoted_names(signals)}" if plant.dt else f"the derivative of {quoted_names(signals)}"
     single = len(outputs) == 1
     note = (
-        f"The output{'' if single else 's'} {', '.join(outputs)} need{'s' if single else ''} {needs}: "
+        f"The output{'' if single else 's'} {quoted_names(outputs)} need{'s' if single else ''} {needs}: "
         f"{'it is' if single else 'they are'} left out, and the design is for the others."
     )
     try:

@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import equilibrated_at
 from obsynth.numerics.ranks import equilibrate
 from obsynth.numerics.spectra import pole_text
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
@@ -117,8 +118,10 @@ def _differentiated(plant: DescriptorSystem) -> str:
         return (
             "the algebraic equations cannot be solved for the algebraic states without differentiating. Do that first."
         )
-    names, many = ", ".join(signals), len(outputs) > 1
-    needed = f"the output{'s' if many else ''} {', '.join(outputs)} need{'' if many else 's'} the derivative of {names}"
+    names, many = quoted_names(signals), len(outputs) > 1
+    needed = (
+        f"the output{'s' if many else ''} {quoted_names(outputs)} need{'' if many else 's'} the derivative of {names}"
+    )
     if set(signals) <= set(plant.noise_names):
         return f"{needed}, white noise in a constraint. Leave that noise out of Bw."
     return f"{needed}, as a constraint ties them to it."

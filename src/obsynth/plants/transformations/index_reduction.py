@@ -27,6 +27,7 @@ from flint import fmpq, fmpq_mat
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, but_rounding
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.input_derivatives import MOST_DERIVATIVES, derivative_name, derivative_of
@@ -313,9 +314,9 @@ def _require_proper(plant: DescriptorSystem, differentiated: FloatArray) -> None
         word = "a later sample" if plant.dt else "the derivative"
         several = len(outputs) > 1
         raise PreconditionError(
-            f"The plant has index 2 or more, and its output{'s' if several else ''} {', '.join(outputs)} "
-            f"need{'' if several else 's'} {word} of {', '.join(needed)}, as a constraint ties them to it: there is no "
-            f"proper form with {'these outputs' if several else 'this output'}.",
+            f"The plant has index 2 or more, and its output{'s' if several else ''} {quoted_names(outputs)} "
+            f"need{'' if several else 's'} {word} of {quoted_names(needed)}, as a constraint ties them to it: there "
+            f"is no proper form with {'these outputs' if several else 'this output'}.",
             condition="index",
             signals=(*outputs, *needed),
         )
