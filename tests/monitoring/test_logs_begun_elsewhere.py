@@ -51,6 +51,20 @@ def test_nothing_leaves_a_picture_in_which_nothing_is_hidden(design: obsynth.Obs
     plt.close(faults.figure)
 
 
+def test_logs_that_end_before_the_observer_has_settled_are_refused_with_the_reason(log: pd.DataFrame) -> None:
+    """No output shows the state that decays by a five-hundredth a second.  A shorter warm-up, as is said, helps."""
+    plant = obsynth.DescriptorSystem(
+        A=np.diag([0.998, 0.9]), C=[[0.0, 1.0]], Bf=[[0.0], [1.0]], output_names=["y2"], dt=1.0
+    )
+    slow = obsynth.fault_estimation_filter(plant)
+    with pytest.raises(obsynth.SpecError, match=r"400 of the 400 rows are warm-up: this lasts 1960 s"):
+        obsynth.learn_thresholds(slow, log)
+    assert obsynth.learn_thresholds(slow, log, warm_up=100.0).rows == 300
+    run = obsynth.run_on_data(slow, log, thresholds={"fhat[f1]": 1.5})
+    assert 1900.0 < run.warm_up < 2000.0
+    assert "the observer was still settling, for 1960 s (32.6 min)" in repr(run)
+
+
 @pytest.mark.parametrize("share", [1.0, 0.25])
 def test_what_is_left_of_the_start_is_told_for_the_warm_up_that_is_given(
     design: obsynth.ObserverDesign, log: pd.DataFrame, share: float

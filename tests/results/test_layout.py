@@ -5,7 +5,8 @@ import pytest
 
 from obsynth.numerics.spectra import pole_text
 from obsynth.results.checks import information, lower_bound_check, upper_bound_check
-from obsynth.results.layout import bound_number, complex_numbers, lower_number, number, shown_numbers, upper_number
+from obsynth.results.layout import shown_numbers
+from obsynth.results.number_texts import bound_number, complex_numbers, lower_number, number, upper_number
 
 
 @pytest.mark.parametrize("seed", range(20))

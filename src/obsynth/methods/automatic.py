@@ -15,7 +15,7 @@ from obsynth.numerics.arguments import field_types
 from obsynth.numerics.suggestions import suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number
+from obsynth.results.number_texts import number
 from obsynth.simulation.scenario import Scenario
 
 #: The method of the least gain, which has options of its own for what is least: it is not chosen, but named where it

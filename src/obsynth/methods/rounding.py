@@ -19,6 +19,7 @@ from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.results.number_texts import number
 from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.settled_faults import SLOWEST_SETTLING, has_steady_state
 
@@ -73,8 +74,6 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
 
 def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
     """Yield a note for each fault whose estimate, while it stays constant, running in double precision may move."""
-    from obsynth.results.layout import number  # rich comes with it, which a run on a log does without
-
     if not _is_examined(plant, observer, MOST_STEADY_STATES):
         return
     with np.errstate(all="ignore"):

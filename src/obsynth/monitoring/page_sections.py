@@ -25,7 +25,8 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.report.page_tables import copied_table, fact_rows, listed, table_lines
 from obsynth.report.pictures import stacked
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import headed_table, number
+from obsynth.results.layout import headed_table
+from obsynth.results.number_texts import number
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.simulate import Simulation
 

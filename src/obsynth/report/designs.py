@@ -34,16 +34,8 @@ from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.report.plots.frequency import FaultGains, fault_gains
 from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import (
-    bound_number,
-    facts_table,
-    headed_table,
-    name_list,
-    number,
-    print_checks,
-    print_section,
-    upper_number,
-)
+from obsynth.results.layout import facts_table, headed_table, print_checks, print_section
+from obsynth.results.number_texts import bound_number, name_list, number, upper_number
 from obsynth.results.registered import is_registered, registered
 from obsynth.verification.assumptions import Assumptions
 

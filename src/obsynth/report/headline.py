@@ -20,7 +20,7 @@ from obsynth.report.designs import (
     gains_if_linear,
     is_of_held_disturbances,
 )
-from obsynth.results.layout import duration, number, upper_number
+from obsynth.results.number_texts import duration, number, upper_number
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign

@@ -13,7 +13,8 @@ from rich.table import Table
 from obsynth.files.tables import aligned
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.checks import Check, Status
-from obsynth.results.layout import number, shown_numbers, verdict, worth
+from obsynth.results.layout import shown_numbers, verdict, worth
+from obsynth.results.number_texts import number
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _CHECK_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}

@@ -23,15 +23,8 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check
-from obsynth.results.layout import (
-    checks_table,
-    complex_numbers,
-    facts_table,
-    headed_table,
-    name_list,
-    print_section,
-    printed,
-)
+from obsynth.results.layout import checks_table, facts_table, headed_table, print_section, printed
+from obsynth.results.number_texts import complex_numbers, name_list
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.plant import PLANT_MATRICES
 

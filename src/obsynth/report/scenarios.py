@@ -9,7 +9,8 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.results.layout import duration, headed_table, number, print_section, printed
+from obsynth.results.layout import headed_table, print_section, printed
+from obsynth.results.number_texts import duration, number
 
 if TYPE_CHECKING:
     from obsynth.simulation.simulate import Simulation

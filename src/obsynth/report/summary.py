@@ -46,7 +46,8 @@ from obsynth.report.designs import (
 from obsynth.report.plants import plain_table
 from obsynth.report.plots.frequency import FaultGains
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import bound_number, lower_number, number, upper_number, verdict_line
+from obsynth.results.layout import verdict_line
+from obsynth.results.number_texts import bound_number, lower_number, number, upper_number
 from obsynth.verification.constant_faults import CONSTANT_FAULT
 
 #: Faults, warnings and notes that are listed; the others are counted.

@@ -204,7 +204,7 @@ def _other_beginnings(
     design: ObserverDesign, scenario: Scenario, eliminated: Sequence[str], bench: Bench
 ) -> Iterator[str]:
     """Yield what a scenario says of states that follow from others, where it shows that they begin elsewhere."""
-    from obsynth.results.layout import number
+    from obsynth.results.number_texts import number
 
     recovery, plant = design.recovery, design.plant
     if recovery is None or not isinstance(plant, DescriptorSystem):

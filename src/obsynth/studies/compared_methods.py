@@ -10,7 +10,7 @@ from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number
+from obsynth.results.number_texts import number
 from obsynth.studies.ranking import NO_DELAYS, mean_delay, relative_error
 
 

@@ -31,7 +31,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import duration
+from obsynth.results.number_texts import duration
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.studies.compared_methods import ComparedMethod, FaultComparison

@@ -24,7 +24,7 @@ from obsynth.results.certificate_files import RESULT_FILE, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
-from obsynth.results.layout import number, upper_number
+from obsynth.results.number_texts import number, upper_number
 from obsynth.studies.compared_methods import ComparedMethod, FaultComparison
 from obsynth.studies.equal_delays import HEALTHY_TIME
 from obsynth.studies.plots.comparison import drawn_comparison

@@ -19,7 +19,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import upper_number
+from obsynth.results.number_texts import upper_number
 from obsynth.simulation.scenario import Scenario
 from obsynth.studies.comparison import DEVIATIONS, LONGEST_WINDOW
 

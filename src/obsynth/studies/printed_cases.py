@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.results.layout import bound_number, headed_table
+from obsynth.results.layout import headed_table
+from obsynth.results.number_texts import bound_number
 
 #: Number of blanks between columns.
 _BLANKS_BETWEEN = 2

@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.certificate_files import SHOWN_DIGITS
-from obsynth.results.layout import number
+from obsynth.results.number_texts import number
 from obsynth.studies.equal_delays import HEALTHY_TIME
 
 #: Where nothing is known of delays on a log, a method comes last.

@@ -14,7 +14,8 @@ from rich.text import Text
 
 from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
 from obsynth.report.scenarios import NOT_SETTLED, worst_rows
-from obsynth.results.layout import headed_table, number, print_section, printed
+from obsynth.results.layout import headed_table, print_section, printed
+from obsynth.results.number_texts import number
 
 if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor

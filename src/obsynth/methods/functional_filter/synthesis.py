@@ -44,7 +44,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.results.design import Certificate
-from obsynth.results.layout import duration
+from obsynth.results.number_texts import duration
 from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 

@@ -12,7 +12,7 @@ from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.suggestions import fields_suggested
 from obsynth.results.design import ObserverDesign, describe_parameters
-from obsynth.results.layout import number
+from obsynth.results.number_texts import number
 from obsynth.results.registered import registered
 
 if TYPE_CHECKING:

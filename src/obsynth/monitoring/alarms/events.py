@@ -17,6 +17,7 @@ from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.results.number_texts import duration
 
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"
@@ -60,7 +61,7 @@ NO_ALARM = "No alarm"
 
 #: Why a row cannot alarm, by its status.
 REASONS = {
-    WARM_UP: "the observer was still settling (shorten with --warm-up)",
+    WARM_UP: "the observer was still settling, for {warm_up} (shorten with --warm-up)",
     OUT: "a scheduling parameter, an input, a measurement or the estimate was outside the region, or had been so until "
     "recently",
     RECOVERING: "the observer was still settling after a gap (shorten with --warm-up)",
@@ -392,7 +393,8 @@ def silence(run: Any, by: str) -> list[str]:
     if silent:
         causes = {status: count for status, count in run.silent.items() if status != PARTIAL}
         why = [
-            f"{f'{count}: ' if len(causes) > 1 else ''}{REASONS.get(status, status)}"
+            (f"{count}: " if len(causes) > 1 else "")
+            + REASONS.get(status, status).format(warm_up=duration(run.warm_up))
             for status, count in causes.items()
         ]
         first = "the first " if set(causes) == {WARM_UP} else ""

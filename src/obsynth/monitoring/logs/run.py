@@ -86,6 +86,8 @@ class DataRun:
         How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
     statement : str
         What the threshold of its monitor promises, and what that rests on; empty without one.
+    warm_up : float, seconds
+        How long nothing is decided after the start.
     stuck : mapping of str to tuple of (int, int)
         First and last rows, from 1, in which an output repeats one value for longer than it otherwise does.
 
@@ -118,6 +120,7 @@ class DataRun:
     events: tuple[AlarmEvent, ...] = ()
     silent: Mapping[str, int] = field(default_factory=dict)
     statement: str = ""
+    warm_up: float = 0.0
     stuck: Mapping[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -135,6 +138,7 @@ class DataRun:
             "events": [event.as_dict() for event in self.events],
             "rows_in_alarm": rows_in_alarm(self.events),
             "silent": dict(self.silent),
+            "warm_up": self.warm_up,
             "isolated": self.isolated,
             "recovered": dict(self.recovered),
             "outliers": dict(self.outliers),
@@ -376,6 +380,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
         alarm_rows=dict(run.alarm_rows),
         events=run.events.events(),
         silent=dict(run.events.silent),
+        warm_up=run.observer.warm_up,
         stuck=stuck,
     )
 

@@ -36,7 +36,7 @@ from obsynth.report.plots.panels import (
     with_unit,
 )
 from obsynth.results.design import ObserverDesign, unverified_mark
-from obsynth.results.layout import number
+from obsynth.results.number_texts import number
 
 if TYPE_CHECKING:
     import pandas as pd

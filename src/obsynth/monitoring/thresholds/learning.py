@@ -44,6 +44,7 @@ from obsynth.numerics.arguments import NonNegative, Seed, arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import duration
 
 #: Deviations of its noise below which an offset of a sensor that alarms is told of one log, and of several: by so much
 #: sensors are off in healthy logs, and logs that hold such offsets raise the levels above what they do.
@@ -168,7 +169,7 @@ def learn_thresholds(
         innovation=output.innovation_size(),
         outlier_sizes=normal.runs.outlier_sizes,
         initial_covariance=normal.runs.initial_covariance,
-        missing=logs.missing(signals),
+        missing=logs.missing(signals) + _long_warm_up(runs, logs),
         **options,
     )
     white = learned.statistics.model.whitened(watched_rows(design, learned, output.watched))
@@ -185,6 +186,20 @@ def learn_thresholds(
         without_drift=tuple(signals.names[signals.inputs + i] for i in without_room),
         drift_limits=_drift_limits(normal.runs, logs, offsets, learned) if drifts is None else {},
         ranges=_ranges(signals, deviations, output, white, learned, options["logs"]),
+    )
+
+
+def _long_warm_up(runs: NormalRuns, logs: NormalLogs) -> str:
+    """Return how much of the logs is warm-up, as a sentence with a blank before it; empty where it is less than half
+    of them."""
+    warm_up = runs.begun().observer.warm_up
+    rows = sum(int(np.sum(times - times[0] < warm_up)) for times in (logs.rows[a:b, 0] for a, b in logs.ends if a < b))
+    if 2 * rows < len(logs.rows):
+        return ""
+    return (
+        f" {rows} of the {len(logs.rows)} rows are warm-up: this lasts {duration(warm_up)} from the start of each log"
+        f"{'' if runs.warm_up is not None else ', until the slowest mode of the observer has shrunk to 2 %'}. Give "
+        "longer logs, or a shorter warm-up (--warm-up) where logs begin near the operating point of the design."
     )
 
 
