@@ -194,3 +194,10 @@ def test_large_gain_sets_have_a_binary_member(tmp_path):
         file.write_bytes(content[:end])
         with pytest.raises(obsynth.SpecError):
             obsynth.load(file)
+
+
+def test_a_column_of_a_printed_sweep_is_headed_by_the_last_part_of_its_name(spec):
+    found = obsynth.sweep(spec, {"gamma_margin": [0.05, 0.5], "plant.C.outputs": [["x1", "x3"], ["x1"]]})
+    heading = next(line for line in str(found).splitlines() if line.startswith("case"))
+    assert "outputs" in heading
+    assert "plant" not in str(found)

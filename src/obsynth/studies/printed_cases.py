@@ -42,6 +42,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
 
     listed = [tuple("" if cell == "nan" else cell for cell in row) for row in rows]
     columns = dict(zip(header, zip(*listed, strict=True), strict=True)) if listed else {}
+    headings = {name: _heading(name, header) for name in header}
     filled = {name: column for name, column in columns.items() if any(column)}
     same = {name: column[0] for name, column in filled.items() if len(listed) > 1 and len(set(column)) == 1}
     printed, widths, missing, room = (
@@ -53,7 +54,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
     for name, column in filled.items():
         if name not in same:
             # Texts fold at blanks, so a column needs the width of its longest word; a cut number would be wrong.
-            words = [word for text in (_heading(name), *column) for word in text.split()]
+            words = [word for text in (headings[name], *column) for word in text.split()]
             wide = max(map(len, words)) + _BLANKS_BETWEEN
             if wide <= room:
                 printed[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
@@ -64,7 +65,7 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
         lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
     if missing:
         lines.append(f"In {rest} alone: {', '.join(missing)}.")
-    table = headed_table(*map(_heading, printed))
+    table = headed_table(*(headings[name] for name in printed))
     for place, (name, cells) in zip(table.columns, printed.items(), strict=True):
         # Remaining space goes to the first columns whose texts are longer.
         more = min(max(map(len, cells)) - widths[name], room)
@@ -74,6 +75,10 @@ def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]],
     return Group(*map(Text, lines), Text(), table)
 
 
-def _heading(name: str) -> str:
-    """Return the name of a column in words, with blanks where it may fold; table.csv keeps the name itself."""
-    return name.replace(".", ". ").replace("_", " ")
+def _heading(name: str, names: Sequence[str]) -> str:
+    """Return the name of a column in words: its last part, or all of it where another column ends like it.
+
+    It may fold at its blanks; table.csv keeps the name itself."""
+    last = name.rpartition(".")[2]
+    is_alone = sum(other.rpartition(".")[2] == last for other in names) == 1
+    return (last if is_alone else name.replace(".", ". ")).replace("_", " ")
