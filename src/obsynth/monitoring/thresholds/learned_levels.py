@@ -1,9 +1,11 @@
-"""Levels of alarms from rows without faults: a bootstrap of all that is estimated.
+"""Alarm levels from rows without faults, by a bootstrap.
 
-Beside the statistics of whitened rows (`learned_statistics`) stand, where fault estimates follow from a walk of theirs,
-likelihood ratios of changes of each (`parameter_scores`).  The bootstrap makes streams from blocks of the whitened rows
-(Politis & Romano 1994) whose largest follow a generalised Pareto tail; from each it fits everything again, so that the
-uncertainty of a short log is in the levels, which hold in `SURE_STREAMS` of the streams (after Gandy & Kvaloy 2013).
+Levels are found for the statistics of whitened rows (`learned_statistics`) and, where the design models faults as
+random walks, for the likelihood ratios of a change of each fault (`parameter_scores`).  The bootstrap draws streams of
+rows in blocks from the whitened rows (Politis & Romano 1994); the largest of them are drawn from a generalised Pareto
+tail.  From each stream all that was estimated from the log is estimated again.  In this way the levels take into
+account how little a short log says: the rate of alarms holds in the share `SURE_STREAMS` of the streams (after Gandy &
+Kvaloy 2013).
 """
 
 from __future__ import annotations
@@ -21,74 +23,79 @@ from obsynth.monitoring.thresholds.slow_offsets import offset_bound
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 
-#: An alarm ends when so many rows in a row were below the level.
+#: An alarm ends after this many consecutive rows below the level.
 HOLD = 20
 
-#: How far the level of each age is its own at one rate for all of them (one), or the same for all (zero).  In noise of
-#: heavy tails old steps need a lower level than new ones, which one wrong row makes likely.  With 1, 30 logs of 2,000
-#: rows told a third of a deviation after .44 (5 degrees of freedom) to .95 (ARMA) times the rows, but a deviation of a
-#: resonance after 1.16, and three deviations in three signals after 1.22 times; so .73 to .98, 1.05 and 1.03 times.
+#: Exponent between one level for all ages (0) and a level for each age at which all have the same rate (1).  In noise
+#: with heavy tails, old steps need a lower level than new ones, because a single wrong row resembles a new step.
+#: Measured in 30 logs of 2,000 rows, as ratios to the delay with exponent 0.  With 1: a step of a third of a deviation,
+#: .44 (t noise of 5 degrees of freedom) to .95 (ARMA); a step of one deviation of a resonance, 1.16; of three
+#: deviations in three signals, 1.22.  With 1/2: .73 to .98, 1.05 and 1.03.
 OWN_LEVEL_SHARE = 0.5
 
-#: Streams from which that is found, and how many times the oldest age there are rows for each alarm in them at least:
-#: ratios of old steps stay above their level for as long.
+#: Number of streams from which the levels of ages are found, and least number of rows for each alarm in them, in
+#: multiples of the oldest age: the likelihood ratio of an old step stays above its level for about as long as its age.
 AGE_STREAMS, AGES_APART = 8, 5
 
-#: Rows at the begin of a stream in which the statistics are not those of a long one.
+#: Rows at the start of a stream that do not count, since the statistics have not settled.
 SETTLING = 100
 
-#: Streams of the bootstrap, their share in which the rate is to hold, and the rows that each is judged on.
+#: Number of streams of the bootstrap, and the share of them in which the rate must hold.
 STREAMS, SURE_STREAMS = 24, 0.8
 
+#: Least and largest number of rows of a stream, and how many times the rows of one alarm it has otherwise.
 LEAST_STREAM_ROWS, MOST_STREAM_ROWS, ROWS_PER_ALARM = 4_000, 20_000, 4
 
 #: Rows until the simulated streams are stationary.
 BURN_IN_ROWS = 200
 
-#: Share of the radii that follow the Pareto tail, least number of them, and bounds of its shape: with a lighter tail
-#: than the least, logs of 500 white rows rang 2.7 times too often.
+#: Share of the radii to which the Pareto tail is fitted, their least number, and bounds of the shape parameter.  With a
+#: smaller lower bound, thresholds from logs of 500 white rows alarmed 2.7 times too often.
 TAIL_SHARE, LEAST_TAIL, SHAPES = 0.1, 20, (-0.05, 0.4)
 
-#: A plotting position of weighted moments, and a shape that is an exponential one.
+#: Plotting position of the probability-weighted moments, and the shape below which the tail is exponential.
 POSITION, NO_SHAPE = 0.35, 1e-6
 
-#: How many times rarer than all together each statistic may ring, tried in turn.
+#: Factors, tried in turn, by which the alarms of one statistic are rarer than those of all statistics together.
 RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 
-#: So many times the rows of a rate show it themselves: with 20 alarms in their second half, 1.5 times the rate is
-#: passed in 2 % of logs.
+#: A log with this many times the rows between two alarms gives the levels directly, by order statistics.  With 20
+#: alarms in its second half, the rate exceeds 1.5 times the stated one in 2 % of logs.
 CONFORMAL = 40
 
-#: The size of the residuals follows itself where its autocorrelation is above the second number on average of so many
-#: lags, and by so many deviations of chance: of 120 logs of noise of 5 degrees of freedom (500 to 2,000 rows) it is .03
-#: at most, of 32 of a linear design .05, and of noise whose variance follows itself by .95 .06 to .15 in nine of ten.
+#: The variance of the residuals counts as correlated where the autocorrelation of their sizes, averaged over this many
+#: lags, exceeds the second number and is this many standard deviations from zero.  The average was at most .03 in 120
+#: logs of t noise of 5 degrees of freedom (500 to 2,000 rows), at most .05 in 32 logs of a linear design, and .06 to
+#: .15 in nine of ten logs of noise whose variance is an autoregression with the coefficient .95.
 SIZE_LAGS, SIZE_AUTOCORRELATION, CHANCE_DEVIATIONS = 10, 0.055, 3.1
 
-#: Large ones come together then: levels are learned for alarms that are so many times as rare.  Of 25 logs each of such
-#: noise (2,000 rows, one alarm in 1,000) rates were .98 and 1.10 times the stated ones without this, .76 and .87 with
-#: it, and 20 % and 8 % of the logs were above 1.5 times, or 8 %.
+#: Large residuals then come in groups, and levels are learned for alarms that are rarer by this factor.  Measured for
+#: two kinds of such noise, 25 logs of 2,000 rows each, one alarm in 1,000 rows: without the factor the rates were .98
+#: and 1.10 times the stated one, and 20 % and 8 % of the logs exceeded 1.5 times; with it .76 and .87 times, and 8 %.
 RARER_WHERE_SIZES_LAST = 1.5
 
-#: Rows that are needed, of each that one row is remembered for.
+#: Number of rows that a log must have, in multiples of the rows over which the whitening model remembers one row.
 MEMORIES = 100.0
 
-#: The same of estimates, whose usual size each stream finds again: with 14 to 28 times what they remember 1.5 times the
-#: rate was passed in 4 to 7 % of logs, with 6 times in 17 %.
+#: The same for fault estimates, whose usual size is estimated again from each stream.  The rate exceeded 1.5 times the
+#: stated one in 4 to 7 % of logs of 14 to 28 times their memory, and in 17 % of logs of 6 times.
 MEMORIES_OF_ESTIMATES = 12.0
 
-#: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
+#: A rate counts as observed when the streams hold this many alarms; lower rates are extrapolated.
 OBSERVED = 10.0
 
 
 def _levels_by_age(parts: Sequence[tuple[Statistics, FloatArray]], every: float) -> FloatArray:
-    """Return what likelihood ratios of each age are to be divided by, ``(2 s, ages)``, of mean one over ages, from
-    normal streams: statistics and white rows ``(1, n, m)`` of each."""
+    """Return the numbers ``(2 s, ages)`` by which likelihood ratios are divided; their mean over ages is one.
+
+    ``parts``: the statistics of each normal stream, and its whitened rows ``(1, n, m)``.
+    """
     rate = min(max(every * RARER[0], AGES_APART * max(AGES)), sum(e.shape[1] - SETTLING for _, e in parts) / OBSERVED)
     by_age = []
     for i in range(2 * len(parts[0][0].signature_names)):
         runs = [list(likelihood_ratios(e, *(part[i] for part in judged.responses()))) for judged, e in parts]
         own = [level_of(np.concatenate(ages), rate) for ages in zip(*runs, strict=True)]
-        # Ages for which the streams are too short are as the oldest of them.
+        # Streams that are too short for an age: it takes the level of the oldest age that they are long enough for.
         by_age.append(own + own[-1:] * (len(AGES) - len(own)))
     levels = np.maximum(by_age, SMALLEST) ** OWN_LEVEL_SHARE
     return read_only(levels / levels.mean(axis=1, keepdims=True))
@@ -100,7 +107,7 @@ def count_alarms(values: FloatArray, level: float) -> int:
 
 
 def _apart(values: FloatArray) -> FloatArray:
-    """Return streams in one, with rows between them that part their alarms; `SETTLING` rows are left out."""
+    """Return all streams in one row, without their first `SETTLING` rows; what is put between them separates alarms."""
     runs = np.atleast_2d(values)[:, SETTLING:]
     return np.hstack([runs, np.full((len(runs), HOLD + 1), -np.inf)]).ravel()
 
@@ -110,21 +117,23 @@ def _begins(places: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def level_of(values: FloatArray, every: float) -> float:
-    """Return the level with one alarm per ``every`` rows in streams ``(runs, n)``; the largest value where these are
+    """Return the level with one alarm per ``every`` rows in streams ``(runs, n)``; the largest value where the rows are
     too few."""
     return _Ordered(values, every).level(every)
 
 
 class _Ordered:
-    """Streams ``(runs, n)`` in one, with the places of their highest values in order: for levels of alarms that are as
-    rare as ``every`` or rarer."""
+    """Streams ``(runs, n)`` in one row, and the places of their highest values in descending order.
+
+    Only so many values are sorted as levels need that give one alarm per ``every`` rows or fewer.
+    """
 
     def __init__(self, values: FloatArray, every: float) -> None:
         self.streams = _apart(values)
         self.rows = int(np.atleast_2d(values)[:, SETTLING:].size)
         below, count = -self.streams, self._looked_at(every)
-        # The highest first; of equal ones the first comes first.  Only these need an order: the others are many.  What
-        # is no number is no less than any, and comes last.
+        # Descending order; of equal values the first comes first.  Sorting all of them would take long.  NaN fails the
+        # comparison, so that it is among the places, and sorts last.
         places = np.flatnonzero(~(below > np.partition(below, count - 1)[count - 1]))
         self.order = places[np.argsort(below[places], kind="stable")][:count]
 
@@ -140,7 +149,8 @@ class _Ordered:
         def alarms(count: int) -> int:
             return len(_begins(np.sort(order[:count])))
 
-        # The first descent of the level at which there are too many: alarms grow nearly always with the rows above.
+        # Bisection for the first count of rows above the level with too many alarms: the number of alarms nearly always
+        # grows with the number of rows above the level.
         low, high = int(allowed), int(allowed)
         while high < len(order) and alarms(high) <= allowed:
             low, high = high, min(len(order), int(1.2 * high) + 1)
@@ -171,14 +181,14 @@ class Tail(NamedTuple):
         return cls(begin, mean * (1.0 - shape), shape)
 
     def drawn(self, uniform: FloatArray) -> FloatArray:
-        """Return radii above the begin from numbers between 0 and 1."""
+        """Return radii above ``begin`` from numbers between 0 and 1."""
         if abs(self.shape) < NO_SHAPE:
             return np.asarray(self.begin - self.scale * np.log(uniform))
         return np.asarray(self.begin + self.scale * (uniform**-self.shape - 1.0) / self.shape)
 
 
 def drawn_places(n: int, runs: int, rows: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return places ``(runs, rows)`` in ``n`` rows, of blocks of these."""
+    """Return the places ``(runs, rows)`` of rows that a stationary bootstrap draws in blocks from ``n`` rows."""
     new = rng.random((runs, rows)) < n ** (-1.0 / 3.0)
     new[:, 0] = True
     begun = np.maximum.accumulate(np.where(new, np.arange(rows), 0), axis=1)
@@ -187,29 +197,30 @@ def drawn_places(n: int, runs: int, rows: int, rng: np.random.Generator) -> NDAr
 
 
 def drawn_rows(e: FloatArray, places: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
-    """Return the white rows ``(n, m)`` at places ``(runs, rows)``, the largest drawn from their tail."""
+    """Return the whitened rows ``e (n, m)`` at places ``(runs, rows)``; the sizes of the largest are drawn from their
+    tail."""
     rows, radii = e[places], np.linalg.norm(e, axis=1)
     tail = Tail.of(radii)
     far = radii[places] > tail.begin
-    # Numbers in (0, 1]: zero would be infinitely far.
+    # Numbers in (0, 1], since zero would give an infinite radius.
     longer = tail.drawn(1.0 - rng.random(int(far.sum())))
     rows[far] *= (longer / radii[places][far])[:, None]
     return np.asarray(rows)
 
 
 def is_conformal(rows: int, every: float) -> bool:
-    """Whether so many rows show the rate themselves, so that no bootstrap has to."""
+    """Whether a log of this many rows gives the levels directly, without a bootstrap."""
     return rows >= CONFORMAL * every
 
 
 def conformal_levels(
     x: FloatArray, every: float, statistics: Statistics, scores: Scores | None = None, logs: Sequence[slice] = ()
 ) -> tuple[Statistics, FloatArray]:
-    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels ``(k,)`` from the second;
-    ``scores``: what these rows say of faults, which are where the first half has them.
+    """Return statistics fitted to the first half of the rows ``x (n, m)``, and levels ``(k,)`` from the second half.
 
-    Alarms in the second half are as exchangeable with later ones as blocks of rows are (split conformal: Papadopoulos
-    et al. 2002).
+    Alarms in the second half are as exchangeable with later alarms as blocks of rows are (split conformal prediction,
+    Papadopoulos et al. 2002).  ``scores``: information of the rows on the faults, whose usual values are those of the
+    first half.
     """
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
@@ -226,21 +237,24 @@ def conformal_levels(
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
     levels = _of_deviations(own, usual) * exchangeable_level(union, rows, every)
     if len(logs) < 2:
-        # Where many rows of one log lie elsewhere, they have raised these levels already.
+        # Offsets of one log that last for many of its rows have raised these levels already.
         return fitted, read_only(levels)
     return with_bands(fitted, x, scores, logs), with_room_for_offsets(levels, fitted, x, logs)
 
 
 def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray, bands: FloatArray | None = None) -> FloatArray:
-    """Return twice the largest log likelihood ratios of changes of each fault from there by more than ``bands (nf,)``,
-    and the squares of estimates in units of what is usual, ``(2 nf, n)``."""
+    """Return ``(2 nf, n)``: for each fault the change ratio and the square of its estimate in units of ``sizes``.
+
+    The change ratio is twice the largest log likelihood ratio of a change away from ``centre`` by more than the fault's
+    band.
+    """
     changes = change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES, bands)
     squares = scores.followed(centre, 0.0 if bands is None else bands).T ** 2
     return np.concatenate([changes, np.nan_to_num(squares / sizes[:, None])])
 
 
 def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
-    """Return where normal rows have the faults, and the usual squares of estimates from there ``(nf,)``."""
+    """Return the usual values of the faults in normal rows, and the mean squares of estimates about them ``(nf,)``."""
     centre = scores.centre()
     return centre, np.nanmean(scores.followed(centre) ** 2, axis=0)
 
@@ -253,17 +267,63 @@ def learned_levels(
     scores: Scores | None = None,
     logs: Sequence[slice] = (),
 ) -> tuple[Statistics, FloatArray, bool]:
-    """Return statistics with levels by age, the levels ``(k,)`` for one alarm per ``every`` rows from rows ``(n, m)``
-    without faults, and whether they are extrapolated; ``scores``: what these rows say of faults."""
-    rng = np.random.default_rng(seed)
-    model, n = statistics.model, len(x)
+    """Return statistics with levels by age, levels ``(k,)``, and whether the levels are extrapolated.
+
+    Parameters
+    ----------
+    x : FloatArray
+        Rows without faults ``(n, m)``.
+    every : float
+        Mean number of rows between alarms.
+    statistics : Statistics
+        The statistics, with the whitening model of these rows.
+    seed : int, optional
+        Of the bootstrap.
+    scores : Scores, optional
+        Information of the rows on the faults.
+    logs : sequence of slice, optional
+        Rows of each log.
+    """
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
+    statistics, runs = _bootstrap(x, every, statistics, rows, np.random.default_rng(seed), scores)
+    total = runs[:, 0, SETTLING:].size
+    seen_rate = min(every, total / OBSERVED)
+    own, union = _union(runs, seen_rate, total)
+    level = level_of(union, seen_rate)
+    # The alarms of one stream alone cannot be as rare as those of all streams together.
+    shown_rate = min(seen_rate, rows / ROWS_PER_ALARM)
+    of_streams = np.array([level_of(stream, shown_rate) for stream in union])
+    sure = max(1.0, float(np.quantile(of_streams, SURE_STREAMS)) / level_of(union, shown_rate))
+    if every > seen_rate:
+        # Extrapolation: the level rises by the same amount for each factor between rates.
+        before = level_of(union, seen_rate / OBSERVED)
+        level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
+    usual = None if scores is None else _usual(scores)
+    statistics = with_bands(statistics, x, scores, logs)
+    levels = with_room_for_offsets(_of_deviations(own, usual) * level * sure, statistics, x, logs)
+    return statistics, levels, every > seen_rate
+
+
+def _bootstrap(
+    x: FloatArray,
+    every: float,
+    statistics: Statistics,
+    rows: int,
+    rng: np.random.Generator,
+    scores: Scores | None,
+) -> tuple[Statistics, FloatArray]:
+    """Return statistics with levels by age, and their values ``(STREAMS, k, rows)`` in streams of the bootstrap.
+
+    Each stream is as long as the log and ``rows`` longer: all that is estimated is estimated from its first part, and
+    the values are those of the rest.
+    """
+    model, n = statistics.model, len(x)
     beside = None if scores is None else ScoreModel.of(scores)
     parts = [model.whitened(x), *(() if beside is None else beside.whites)]
     complete = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
     complete[: max(model.order, *(() if beside is None else (beside.model.order, beside.followed.order)), 0)] = False
     e, *beside_whites = [part[complete] - part[complete].mean(axis=0) for part in parts]
-    # What is drawn together happened together.
+    # Residuals and scores of a row are drawn together, since they are dependent.
     places = drawn_places(len(e), STREAMS, BURN_IN_ROWS + n + rows, rng)
     streams = model.simulated(drawn_rows(e, places, rng))
     of_faults = None
@@ -286,41 +346,33 @@ def learned_levels(
             score, information, followed = (part[i] for part in of_faults)
             drawn = Scores(score, information, followed, np.ones_like(followed))
             centre = drawn.chosen(normal).centre()
-            # Estimates follow from what samples before them said, and have a centre of their own.
+            # Estimates are filtered, so that their centre is not that of the scores.
             drawn = replace(drawn, theta=followed - followed[normal].mean(axis=0) + centre)
             sizes = np.mean(drawn.chosen(normal).followed(centre) ** 2, axis=0)
             values = np.concatenate([values, _of_faults(drawn.chosen(slice(-rows, None)), centre, sizes)])
         values_of_streams.append(values)
-    runs = np.array(values_of_streams)
-    total = runs[:, 0, SETTLING:].size
-    seen_rate = min(every, total / OBSERVED)
-    own, union = _union(runs, seen_rate, total)
-    level = level_of(union, seen_rate)
-    # One stream alone shows less rare alarms than all of them.
-    shown_rate = min(seen_rate, rows / ROWS_PER_ALARM)
-    of_streams = np.array([level_of(stream, shown_rate) for stream in union])
-    sure = max(1.0, float(np.quantile(of_streams, SURE_STREAMS)) / level_of(union, shown_rate))
-    if every > seen_rate:
-        # Beyond what the streams show, levels rise by the same amount for each factor between rates.
-        before = level_of(union, seen_rate / OBSERVED)
-        level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
-    usual = None if scores is None else _usual(scores)
-    statistics = with_bands(statistics, x, scores, logs)
-    levels = with_room_for_offsets(_of_deviations(own, usual) * level * sure, statistics, x, logs)
-    return statistics, levels, every > seen_rate
+    return statistics, np.array(values_of_streams)
 
 
 def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
-    """Return the level in normal ``values (runs, n)``, of so many ``rows`` that say something, with one alarm fewer
-    than a rate of one in ``every`` allows: then the mean rate of later rows is at most that, as their alarms are
-    exchangeable with these.
+    """Return the level that normal values pass one time fewer than a rate of one alarm per ``every`` rows allows.
 
-    Where less than a whole alarm is allowed beside the others, the level is as much nearer to that of one more: as a
-    share of what is between them, this leaves the mean at most as stated for tails from even to heavy ones.
+    Then the mean rate in later rows is at most the stated one, since their alarms are exchangeable with these.  Where
+    the allowed number is not whole, the level is interpolated between those of the two whole numbers next to it; the
+    mean rate stays at most as stated for uniform to heavy tails.
+
+    Parameters
+    ----------
+    values : FloatArray
+        The largest statistic of normal rows ``(runs, n)``.
+    rows : int
+        How many of these rows are complete.
+    every : float
+        Mean number of rows between alarms.
     """
     allowed = max(rows / every - 1.0, 0.0)
     alarms_allowed, size = int(allowed), values[:, SETTLING:].size
-    # Halves, as a quotient of a quotient may be less than the whole number.
+    # Half an alarm more, since rounding of the two quotients may give less than the whole number.
     higher, lower = (level_of(values, size / (count + 0.5)) for count in (alarms_allowed, alarms_allowed + 1))
     return higher - (allowed - alarms_allowed) * (higher - lower)
 
@@ -328,9 +380,11 @@ def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
 def normal_statistics(
     x: FloatArray, statistics: Statistics, scores: Scores | None, usual: tuple[FloatArray, FloatArray] | None
 ) -> FloatArray:
-    """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of faults in units of what is
-    ``usual``."""
-    # A row that is missing adds no evidence.
+    """Return the statistics ``(k, n)`` of rows ``(n, m)`` without faults, in the order of the log.
+
+    ``usual``: the usual values of the faults and the mean squares in which squares of estimates are measured.
+    """
+    # A missing row adds no evidence.
     values = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
     if scores is None or usual is None:
         return values
@@ -338,7 +392,7 @@ def normal_statistics(
 
 
 def _of_deviations(own: FloatArray, usual: tuple[FloatArray, FloatArray] | None) -> FloatArray:
-    """Return levels of which those of squares of estimates are in units of the observer's own deviations."""
+    """Return levels; those of squares of estimates in units of the deviations that the observer states."""
     if usual is not None:
         sizes = usual[1]
         own = np.concatenate([own[: -len(sizes)], own[-len(sizes) :] * sizes])
@@ -346,8 +400,10 @@ def _of_deviations(own: FloatArray, usual: tuple[FloatArray, FloatArray] | None)
 
 
 def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, FloatArray]:
-    """Return levels of each statistic at one rarer rate, the least rare with which all together keep theirs, and the
-    largest statistic in units of its level ``(runs, n)``."""
+    """Return a level for each statistic, and the largest statistic in units of its level ``(runs, n)``.
+
+    All statistics have one rate: the highest in `RARER` with which all of them together keep one alarm per ``every``.
+    """
     own, union = np.ones(runs.shape[1]), runs[:, 0]
     ordered = [_Ordered(runs[:, i], every * RARER[0]) for i in range(runs.shape[1])]
     for rarer in RARER:
@@ -359,8 +415,10 @@ def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, Floa
 
 
 def lasting_sizes(white: FloatArray) -> float:
-    """Return the mean autocorrelation of the size of white rows ``(n, m)``, NaN left out, and zero where it may be
-    chance or is small."""
+    """Return the mean autocorrelation of the sizes of whitened rows ``(n, m)``.
+
+    Rows with NaN are left out.  The result is zero where it is small or may be chance.
+    """
     sizes = np.sum(white**2, axis=1)
     scores = normal_scores(sizes[np.isfinite(sizes)])
     products = [float(scores[lag:] @ scores[:-lag]) for lag in range(1, SIZE_LAGS + 1)]
@@ -373,7 +431,8 @@ def lasting_sizes(white: FloatArray) -> float:
 
 
 def normal_scores(values: FloatArray) -> FloatArray:
-    """Return the normal scores of ranks ``(n,)``: neither the distribution nor single values decide then."""
+    """Return the normal scores of the ranks of values ``(n,)``, on which outliers and the distribution have no
+    effect."""
     from scipy.special import ndtri
     from scipy.stats import rankdata
 
@@ -381,15 +440,17 @@ def normal_scores(values: FloatArray) -> FloatArray:
 
 
 def rows_needed(model: Autoregression, every: float, scores: Scores | None = None) -> int:
-    """Return how many rows without faults a rate of one alarm per ``every`` rows needs: as many as between alarms, a
-    hundred times what the residuals remember, and enough for every coefficient; of what they say of faults (``scores``)
-    a hundred times what that remembers, in rows that say as much as most of it comes from, and twelve times what the
-    estimates remember."""
+    """Return how many rows without faults a rate of one alarm per ``every`` rows needs.
+
+    These are the largest of: the rows between two alarms; `MEMORIES` times the memory of the whitening model; 50 for
+    each of its coefficients; with ``scores``, `MEMORIES` times their memory, counted in rows that inform on a fault,
+    and `MEMORIES_OF_ESTIMATES` times the memory of the estimates.
+    """
     m = model.channels
     needed = [every, MEMORIES * model.longest_gain, 50.0 * m * (1 + m * model.order)]
     if scores is not None:
         own = np.einsum("kii->ki", scores.information)
-        # Of n rows of which one alone tells of a fault, one counts.
+        # The effective share of rows that inform: 1 / n where a single row holds all information on a fault.
         share = float((own.sum(axis=0) ** 2 / (own**2).sum(axis=0)).min()) / len(own)
         beside = ScoreModel.of(scores)
         needed += [MEMORIES * beside.model.longest_gain / share, MEMORIES_OF_ESTIMATES * beside.followed.longest_gain]
@@ -397,7 +458,7 @@ def rows_needed(model: Autoregression, every: float, scores: Scores | None = Non
 
 
 def with_bands(statistics: Statistics, x: FloatArray, scores: Scores | None, logs: Sequence[slice]) -> Statistics:
-    """Return statistics in which no offset alarms that the logs, of rows ``(n, m)``, do not exclude."""
+    """Return statistics with bands for all offsets that the logs ``x (n, m)`` do not exclude, so that none alarms."""
     logs = logs or (slice(None),)
     e = statistics.model.whitened(x)
     complete = np.asarray(np.isfinite(e).all(axis=1))
@@ -417,7 +478,7 @@ def with_bands(statistics: Statistics, x: FloatArray, scores: Scores | None, log
 def with_room_for_offsets(
     levels: FloatArray, statistics: Statistics, x: FloatArray, logs: Sequence[slice]
 ) -> FloatArray:
-    """Return levels of T2 and MEWMA raised by what offsets add to them."""
+    """Return levels in which those of T2 and MEWMA are raised by what offsets add to these statistics."""
     size = offset_size(statistics, x, logs)
     gains = np.sqrt([1.0, *((2.0 - share) / share for share in FORGETTING)])
     raised = levels.copy()
@@ -426,7 +487,7 @@ def with_room_for_offsets(
 
 
 def offset_size(statistics: Statistics, x: FloatArray, logs: Sequence[slice]) -> float:
-    """Return how long offsets of the whitened rows are that the logs, of rows ``(n, m)``, do not exclude."""
+    """Return the norm of the largest offset of the whitened rows that the logs ``x (n, m)`` do not exclude."""
     e = statistics.model.whitened(x)
     complete = np.asarray(np.isfinite(e).all(axis=1))
     logs = logs or (slice(None),)

@@ -1,7 +1,7 @@
-"""Statistics of rows: Hotelling's T2, exponentially weighted means, and likelihood ratios of steps and ramps.
+"""Test statistics of residuals: Hotelling's T2, exponentially weighted means, likelihood ratios of steps and ramps.
 
-Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched are Hotelling's T2, exponentially
-weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976).
+An autoregression whitens the residuals (Alwan & Roberts 1988).  An alarm is raised by Hotelling's T2, by exponentially
+weighted moving averages (MEWMA, Lowry et al. 1992) or by likelihood ratios of steps and ramps (Willsky & Jones 1976).
 """
 
 from __future__ import annotations
@@ -14,22 +14,38 @@ import numpy as np
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.autoregression import Autoregression
 
-#: Ages of a step, in rows, and how far the exponentially weighted means look back.
+#: Ages in rows at which a step or a ramp is looked for.
 AGES = (1, 2, 3, 5, 8, 12, 20, 32, 50, 80, 130, 200)
 
+#: Weights of the newest row in the exponentially weighted moving averages.
 FORGETTING = (0.3, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratios of a step
-    and of a ramp; beside these those of a change of each fault of ``estimates``, and the square of its estimate, of
-    which `change_ratios` and `Scores.followed` are apart.
+    """The statistics of whitened rows.
 
-    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``signature_names``: of
-    what they are steps;
-    ``age_levels (2 s, ages)``: what likelihood ratios of steps, then ramps, of each age are divided by, by default one;
-    ``bands (s,)``: offsets along each signature that alarm nothing, and ``fault_bands (nf,)`` those of the faults.
+    These are T2, two MEWMA, and for each signature the largest likelihood ratio of a step and of a ramp.  Where faults
+    are estimated, the likelihood ratio of a change of each fault and the square of its estimate come after them:
+    `change_ratios` and `Scores.followed` compute these.
+
+    Parameters
+    ----------
+    model : Autoregression
+        The model that whitens the signals.
+    signatures : FloatArray
+        ``(s, m)``: the direction of each step, and of the ramp with the same direction, in the signals before they are
+        whitened.
+    signature_names : tuple of str
+        What the step is a step of, such as a sensor.
+    estimates : tuple of str, optional
+        Names of the faults whose changes are tested.
+    age_levels : FloatArray, optional
+        ``(2 s, ages)``: numbers by which the likelihood ratios of steps, then of ramps, are divided; ones by default.
+    bands : FloatArray, optional
+        ``(s,)``: largest offset along each signature that must not raise an alarm.
+    fault_bands : FloatArray, optional
+        ``(nf,)``: the same for the faults.
     """
 
     model: Autoregression
@@ -42,38 +58,43 @@ class Statistics:
 
     @property
     def levels_by_age(self) -> FloatArray:
-        """What likelihood ratios are divided by, ``(2 s, ages)``."""
+        """Numbers by which likelihood ratios are divided, ``(2 s, ages)``."""
         return np.ones((2 * len(self.signature_names), len(AGES))) if self.age_levels is None else self.age_levels
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the statistics, in order."""
+        """Names of the statistics, in order."""
         means = (f"MEWMA {share:g}" for share in FORGETTING)
         likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.signature_names)
         changes = (f"GLR of a change of {name}" for name in self.estimates)
         return ("T2", *means, *likely, *changes, *(f"square of {name}" for name in self.estimates))
 
     def responses(self) -> tuple[FloatArray, FloatArray]:
-        """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
-        what each row after that adds ``(2 s, m)``."""
+        """Return the responses of the whitened rows e to a step, then to a ramp, along each signature.
+
+        The first p + 1 rows, p being the order of the autoregression, are ``(2 s, p + 1, m)``; after them the response
+        grows in each row by ``(2 s, m)``.
+        """
         gone = np.concatenate([np.zeros((1, *np.eye(self.model.channels).shape)), np.cumsum(self.model.A, axis=0)])
         remaining = self.signatures[:, None, :] - np.einsum("jab,sb->sja", gone, self.signatures)
         steps = np.asarray(remaining @ self.model.whitener.T)
-        # A ramp is a sum of steps, of which one more begins in each row.
+        # A ramp is a sum of steps: one more begins in each row.
         return (
             np.concatenate([steps, np.cumsum(steps, axis=1)]),
             np.concatenate([np.zeros_like(steps[:, -1]), steps[:, -1]]),
         )
 
     def long_responses(self) -> FloatArray:
-        """Return what steps, then ramps, of each signature do to ``max(AGES)`` rows of e, ``(2 s, rows, m)``."""
+        """Return the same responses over ``max(AGES)`` rows of e, ``(2 s, rows, m)``."""
         shapes, slopes = self.responses()
         later = shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]
         return np.concatenate([shapes, later], axis=1)[:, : max(AGES)]
 
     def offset_effects(self) -> FloatArray:
-        """Return what offsets at the ends of `bands` do to the roots of likelihood ratios of steps, then ramps, of each
-        age, before these are divided by their levels: ``(2 s, ages)``."""
+        """Return by how much an offset at the end of its band raises the root of a likelihood ratio.
+
+        ``(2 s, ages)``: for steps, then ramps, of each age, before the division by the levels.
+        """
         if self.bands is None:
             return np.zeros((2 * len(self.signature_names), len(AGES)))
         lasting = np.tile(self.responses()[0][: len(self.signature_names), -1] * self.bands[:, None], (2, 1))
@@ -86,8 +107,11 @@ class Statistics:
         return np.asarray(np.abs(sums[:, ages]) / np.sqrt(np.maximum(powers[:, ages], SMALLEST)))
 
     def templates(self) -> FloatArray:
-        """Return weights of the last ``max(AGES)`` rows of e, oldest first, for steps and ramps of each signature and
-        age, of which the squares add up to one over the level of this age: ``(2 s, ages, rows, m)``."""
+        """Return matched filters for steps and ramps of each signature and age, ``(2 s, ages, rows, m)``.
+
+        They weight the last ``max(AGES)`` rows of e, oldest first.  The squares of the weights of one filter add up to
+        one divided by the level of its age.
+        """
         long = self.long_responses()
         weights = np.zeros((len(long), len(AGES), max(AGES), self.model.channels))
         for i, age in enumerate(AGES):
@@ -97,7 +121,7 @@ class Statistics:
         return np.asarray(weights / np.sqrt(self.levels_by_age)[:, :, None, None])
 
     def of_rows(self, e: FloatArray) -> FloatArray:
-        """Return the statistics of white rows ``(runs, n, m)``: all but those of estimates, ``(k, runs, n)``."""
+        """Return the statistics ``(k, runs, n)`` of whitened rows ``(runs, n, m)``, without those of estimates."""
         from scipy.signal import lfilter
 
         statistics = [np.sum(e**2, axis=-1)]
@@ -115,11 +139,21 @@ class Statistics:
 
 
 def likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> Iterator[FloatArray]:
-    """Yield twice the log likelihood ratio ``(runs, n)`` of a step or ramp of each age that the rows are long enough
-    for, whose response is ``shape (p + 1, m)`` and grows by ``slope (m,)`` in each row after these."""
+    """Yield twice the log likelihood ratio ``(runs, n)`` of a step or a ramp, for each age up to the number of rows.
+
+    Parameters
+    ----------
+    e : FloatArray
+        Whitened rows ``(runs, n, m)``.
+    shape : FloatArray
+        The response ``(p + 1, m)`` in the first rows.
+    slope : FloatArray
+        ``(m,)``: by how much the response grows in each row after them.
+    """
     runs, n, _ = e.shape
     last = len(shape) - 1
-    # As if it had been straight from its first row on, by running sums; then what its first rows are besides.
+    # Running sums give the fit of a response that is a straight line from its first row on; ``early`` corrects it for
+    # the rows in which the response is not yet that line.
     straight = shape[-1] + (np.arange(last + 1) - last)[:, None] * slope
     flat, rising = _sums(e @ straight[0]), _sums(e @ slope)
     weighted = _sums((e @ slope) * np.arange(n))
@@ -143,5 +177,5 @@ def likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> It
 
 
 def _sums(values: FloatArray) -> FloatArray:
-    """Return the running sums ``(runs, n + 1)`` of values ``(runs, n)``, from nothing."""
+    """Return the running sums ``(runs, n + 1)`` of values ``(runs, n)``; the first is zero."""
     return np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
