@@ -1,9 +1,9 @@
-"""Hypotheses on an alarm: a fault of the plant, a fault of a sensor, or neither, ranked by posterior shares.
+"""Hypotheses on the cause of an alarm: a fault of the plant, a fault of a sensor, or neither, with posterior shares.
 
-Each hypothesis is a jump, or a straight drift, of one fault or of one sensor's offset. Twice the log likelihood ratio
-that it reaches, at its likeliest begin, is compared with those of the others (Willsky & Jones 1976); all are equally
-likely before. Beside them stands a shift of the residuals in whatever direction: it explains all that lasts, so that
-where no effect of a fault comes near to it, the alarm is none of these faults.
+A hypothesis is a jump or a linear drift of one fault, or of the offset of one sensor.  For each, the log likelihood
+ratio is maximised over the time at which it began (Willsky & Jones 1976); prior probabilities are equal.  One further
+hypothesis, a shift of the residuals in any direction, explains every lasting change.  If no fault explains nearly as
+much as that shift, the alarm is reported as none of these faults.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, SENSOR, R
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, MODEL_SHARE
 from obsynth.numerics.arrays import FloatArray
 
-#: Twice the log likelihood ratio below which nothing is ranked: twice what tells two hypotheses apart.
+#: Twice the log likelihood ratio below which no cause is named: twice the difference that distinguishes two hypotheses.
 LEAST_RATIO = 2.0 * DISTINGUISHED
 
-#: Share of what a shift in any direction explains that the effect of a fault explains at least: effects are those of
-#: the model, and one whose direction is off by less than 45 degrees explains half.
+#: Least share of what a shift in any direction explains that a fault must explain.  The effect of the fault is computed
+#: from the model; an effect whose direction is wrong by 45 degrees explains half.
 EXPLAINED_SHARE = 0.5
 
-#: Two effects that explain the same to this share are one: the fault of a sensor that the plant has already.
+#: Relative difference below which the effects of a fault and of a sensor's offset are the same: the plant already has
+#: that sensor's fault.
 SAME_EFFECT = 1e-6
 
 
@@ -38,8 +39,8 @@ class Hypothesis(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """What hypotheses explain ``(h,)``: twice the log likelihood ratios, sizes and their deviations; and how much a
-    shift in any of so many directions does."""
+    """Twice the log likelihood ratio of each hypothesis, its size and the deviation of that, all ``(h,)``; and twice
+    the log likelihood ratio of a shift in any direction."""
 
     ratios: FloatArray
     sizes: FloatArray
@@ -58,10 +59,10 @@ def hypotheses_of(faults: Sequence[str], outputs: Sequence[str]) -> tuple[Hypoth
 
 
 def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Ranking | None:
-    """Return the ranking of what hypotheses explain; `None` where none of them, and no shift, explains anything, or
-    residuals have overflowed.
+    """Return the ranking of the hypotheses; `None` where neither they nor a shift explain enough, or residuals
+    overflow.
 
-    Where shares do not decide, the faults of the plant come first, and the others are ties.
+    Hypotheses that the shares do not distinguish are ties, with the faults of the plant first.
     """
     if not (np.isfinite(explanation.ratios).all() and np.isfinite(explanation.shift)):
         return None
@@ -69,7 +70,7 @@ def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Rankin
     drifts = set[str]()
     for i, hypothesis in enumerate(hypotheses):
         ratio, before = explanation.ratios[i], best.get(hypothesis.name)
-        # A jump is what is usual: a drift is told where it explains clearly more.
+        # Jumps are more usual: a drift is named only where it explains clearly more.
         if before is None or ratio > explanation.ratios[before] + DISTINGUISHED * ratio_scale(ratio):
             best[hypothesis.name] = i
             (drifts.add if hypothesis.is_drift else drifts.discard)(hypothesis.name)
@@ -92,9 +93,17 @@ def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Rankin
 
 
 def ranked_changes(faults: Sequence[str], ratios: FloatArray, passed: NDArray[np.bool_]) -> Ranking | None:
-    """Return the ranking of slow changes of faults, of which nothing is seen in the residuals that the estimates
-    follow: by twice the log likelihood ratios ``(ages, nf)`` of a change of each, at the likeliest age; `None` where no
-    fault has ``passed (nf,)`` a level by itself."""
+    """Return the ranking of slow changes of faults, which the estimates follow so that no residual shows them.
+
+    Parameters
+    ----------
+    faults : sequence of str
+        Names of the faults.
+    ratios : FloatArray
+        Twice the log likelihood ratios ``(ages, nf)`` of a change of each fault; those of the likeliest age are ranked.
+    passed : array of bool
+        ``(nf,)``: which faults have passed their own level.  The result is `None` where none has.
+    """
     of_age = ratios[int(np.argmax(ratios.max(axis=1)))]
     if not (passed.any() and np.isfinite(of_age).all()):
         return None
@@ -104,13 +113,13 @@ def ranked_changes(faults: Sequence[str], ratios: FloatArray, passed: NDArray[np
 
 
 def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, float], ...], list[str]]:
-    """Return posterior shares by what hypotheses explain, the largest first; and those that are as likely as the best,
+    """Return the posterior shares, the largest first; and the hypotheses that these do not distinguish from the best,
     faults of the plant first."""
     most = max(ratios.values())
     scale = ratio_scale(most)
     weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
     total = sum(weights.values())
-    # Of those that are exactly alike the order says nothing: names decide, so that another order changes no answer.
+    # Equal shares are ordered by name, so that the order of the faults in the plant changes no answer.
     shares = sorted(
         ((name, weight / total) for name, weight in weights.items()),
         key=lambda hypothesis: (-hypothesis[1], hypothesis[0]),
@@ -121,5 +130,5 @@ def _shares_and_nearest(ratios: Mapping[str, float]) -> tuple[tuple[tuple[str, f
 
 
 def ratio_scale(ratio: float) -> float:
-    """Return by how much differences of ratios count less, as effects are those of a model that is not exact."""
+    """Return the divisor of differences between ratios that allows for effects of an inexact model."""
     return max(1.0, MODEL_SHARE * ratio / DISTINGUISHED)

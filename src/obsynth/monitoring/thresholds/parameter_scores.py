@@ -1,9 +1,10 @@
-"""Score and information of each sample on parameters that walk, and likelihood ratios of a change of one of them.
+"""Score and information of each sample on parameters that are random walks, and likelihood ratios of their changes.
 
-A filter follows a fault, and its innovations return to zero.  What a sample alone says of the parameters is what its
-update added to their information: ``J = P^-1 - M^-1`` and ``s = P^-1 theta - M^-1 theta_before``, with the covariance P
-after and M before it.  Sums of ``s - J c`` over the latest rows are the score of a change from c; their square in units
-of the information is twice the log likelihood ratio of a jump at this age (Willsky & Jones 1976).
+After a fault the innovations of a filter return to zero, because its estimate follows the fault.  A test of the
+innovations therefore misses slow faults.  The information that one sample adds is recovered from its update: ``J = P^-1
+- M^-1`` and ``s = P^-1 theta - M^-1 theta_before``, with the covariances M before and P after the update.  The sum of
+``s - J c`` over the latest rows is the score of a change away from c.  Its square in units of the information is twice
+the log likelihood ratio of a jump of that age (Willsky & Jones 1976).
 """
 
 from __future__ import annotations
@@ -21,18 +22,20 @@ from obsynth.numerics.ranks import DIRECTION_SHARE, rounding_rank
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
-#: A fault is named where a change of it alone is more likely than one of any other by so much in twice the log
-#: likelihood (odds of 90), and by this share of its own: where the effect of another fault on the innovations is off by
-#: less than 10 % of its size, that one lies behind by less than the square of it (the sine of the angle between them).
+#: A fault is named where twice the log likelihood of a change of it alone exceeds that of every other fault by the
+#: first number (odds of 90) and by the second as a share of itself.  The share allows for an inexact model: an effect
+#: that is wrong by 10 % of its size lowers twice the log likelihood by less than 1 %, the square of that.
 DISTINGUISHED, MODEL_SHARE = 9.0, 0.01
 
-#: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
+#: Least share of the earlier information that a sample adds: less is rounding of the difference.
 LEAST_ADDED = 1e-9
 
 
 def parameter_walk(observer: Any) -> FloatArray | None:
-    """Return the covariance ``(nf, nf)`` by which parameters walk between samples; `None` where estimates do not follow
-    from such a walk, or samples arrive late."""
+    """Return the covariance ``(nf, nf)`` of the steps of the parameters' random walk.
+
+    `None` where the observer does not model parameters as a random walk, or samples arrive late.
+    """
     if not observer.fault_names:
         return None
     if isinstance(observer, DAEObserver) and not observer.timing.longest:
@@ -47,8 +50,17 @@ def parameter_walk(observer: Any) -> FloatArray | None:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores ``s (..., nf)`` at parameters of zero and information ``J (..., nf, nf)`` of samples, zero where a sample
-    says nothing; and estimates after them with their deviations ``(..., nf)``, NaN where they do not count."""
+    """Scores and information of samples, and the estimates after them.
+
+    Parameters
+    ----------
+    score : FloatArray
+        ``s (..., nf)`` at parameters of zero; zero for a sample without information.
+    information : FloatArray
+        ``J (..., nf, nf)``.
+    theta, deviations : FloatArray
+        Estimates ``(..., nf)`` and their standard deviations; NaN where they do not count.
+    """
 
     score: FloatArray
     information: FloatArray
@@ -65,30 +77,41 @@ class Scores:
         return rounding_rank(total / np.outer(units, units)) == len(units)
 
     def centre(self) -> FloatArray:
-        """Return the parameters that the samples make most likely ``(nf,)``, if they never change."""
+        """Return the most likely values ``(nf,)`` of parameters that never change."""
         return np.asarray(np.linalg.solve(self.information.sum(axis=-3), self.score.sum(axis=-2)[..., None])[..., 0])
 
     def away(self, centre: FloatArray) -> FloatArray:
-        """Return the scores ``(..., nf)`` of a change from there."""
+        """Return the scores ``(..., nf)`` of a change away from ``centre``."""
         return np.asarray(self.score - (self.information @ centre[..., None])[..., 0])
 
     def chosen(self, rows: Any) -> Scores:
-        """Return those of some rows."""
+        """Return the scores of some rows."""
         return Scores(self.score[rows], self.information[rows], self.theta[rows], self.deviations[rows])
 
     def followed(self, centre: FloatArray, bands: FloatArray | float = 0.0) -> FloatArray:
-        """Return how far the estimates are further from there than ``bands (nf,)``, in units of their deviations."""
+        """Return by how much the estimates leave ``centre`` beyond ``bands (nf,)``, in units of their deviations."""
         return beyond(self.theta - centre, bands) / self.deviations
 
 
 def before_any(faults: int) -> FloatArray:
-    """Return what is known of ``faults`` parameters before the first sample, ``(1 + nf, nf)``: nothing."""
+    """Return estimate and covariance before the first sample, one below the other ``(1 + nf, nf)``: NaN, not known."""
     return np.full((1 + faults, faults), np.nan)
 
 
 def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows: int) -> tuple[FloatArray, Scores]:
-    """Return what is known after a sample, and what it says; ``before (1 + nf, nf)``: estimate and covariance after the
-    one ``rows`` earlier, since which parameters have walked."""
+    """Return estimate and covariance after a sample, and the score and information of the sample alone.
+
+    Parameters
+    ----------
+    before : FloatArray
+        Estimate and covariance, one below the other ``(1 + nf, nf)``, after the sample ``rows`` earlier.
+    evidence : Evidence
+        Of the sample.
+    walk : FloatArray
+        Covariance ``(nf, nf)`` of one step of the random walk.
+    rows : int
+        Steps since the earlier sample.
+    """
     theta, spread = evidence.theta, evidence.parameter_covariance
     after = np.vstack([theta, spread])
     nothing = Scores(np.zeros_like(theta), np.zeros_like(spread), theta, np.sqrt(np.diag(spread)))
@@ -101,15 +124,15 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
             return after, nothing
         added = own - prior
         score_of_sample = replace(nothing, score=own @ theta - prior @ before[0], information=0.5 * (added + added.T))
-        # A covariance that has grown beside its walk has started again: what it was before says nothing of this.
+        # A covariance that grows by more than the walk belongs to an observer that has started again.
         if not (np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(own)).all()):
             return after, nothing
     return after, score_of_sample if (np.diag(added) > LEAST_ADDED * np.diag(own)).any() else nothing
 
 
 def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return roots ``(n, nf, nf)`` of matrices, symmetric in the usual units of each parameter, and their inverses in
-    the directions where they are not zero."""
+    """Return square roots ``(n, nf, nf)`` of information matrices, symmetric in the mean units of each parameter, and
+    pseudo-inverses of these roots."""
     units = np.sqrt(np.einsum("kii->ki", information).mean(axis=0))
     sizes, vectors = np.linalg.eigh(information / np.outer(units, units))
     sizes = np.maximum(sizes, 0.0)
@@ -124,8 +147,19 @@ def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 def change_ratios(
     away: FloatArray, own: FloatArray, ages: tuple[int, ...], bands: FloatArray | None = None
 ) -> FloatArray:
-    """Return twice the largest log likelihood ratio over ages of a change of each parameter alone ``(nf, n)`` by more
-    than ``bands (nf,)``, from scores ``(n, nf)`` of a change and the information ``own (n, nf)`` on each."""
+    """Return twice the log likelihood ratio ``(nf, n)`` of a change of each parameter alone, the largest over ages.
+
+    Parameters
+    ----------
+    away : FloatArray
+        Scores ``(n, nf)`` of a change.
+    own : FloatArray
+        Information ``(n, nf)`` on each parameter.
+    ages : tuple of int
+        Ages in rows.
+    bands : FloatArray, optional
+        ``(nf,)``: changes up to this size do not count.
+    """
     widths = np.zeros((away.shape[1], 1)) if bands is None else bands[:, None]
     n, nf = away.shape
     sums, powers = (np.vstack([np.zeros((1, nf)), np.cumsum(part, axis=0)]) for part in (away, own))
@@ -142,8 +176,10 @@ def change_ratios(
 
 
 def most_likely_change(ratios: FloatArray) -> int:
-    """Return the fault of which a change alone explains the most, from twice the log likelihood ratios of changes of
-    each age ``(ages, nf)``, at the most likely age; or that this does not tell the faults apart."""
+    """Return the fault whose change alone explains the most at the likeliest age, or `NOT_DISTINGUISHED`.
+
+    ``ratios``: twice the log likelihood ratios ``(ages, nf)`` of a change of each fault.
+    """
     of_age = ratios[int(np.argmax(ratios.max(axis=1)))]
     best = int(np.argmax(of_age))
     lead = of_age[best] - np.delete(of_age, best).max(initial=0.0)
@@ -152,10 +188,16 @@ def most_likely_change(ratios: FloatArray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ScoreModel:
-    """Normal scores and estimates in units of their deviations, as autoregressions have them, to be drawn again.
+    """Autoregressions of the scores and of the estimates in normal rows, from which a bootstrap draws new ones.
 
-    ``whites (n, nf)``: innovations of scores and of estimates, NaN where a sample says nothing or one before it is
-    missing; ``root`` and ``information (n, nf, nf)`` are those of the samples.
+    Parameters
+    ----------
+    model, followed : Autoregression
+        Of the scores in units of the roots of their information, and of the estimates in units of their deviations.
+    whites : pair of FloatArray
+        Innovations ``(n, nf)`` of the two; NaN where a sample has no information or an earlier one is missing.
+    root, information : FloatArray
+        ``(n, nf, nf)``: of the samples.
     """
 
     model: Autoregression
@@ -166,7 +208,7 @@ class ScoreModel:
 
     @classmethod
     def of(cls, scores: Scores) -> ScoreModel:
-        """Return that of normal rows ``(n, nf)``."""
+        """Return the model of normal rows ``(n, nf)``."""
         root, inverse = roots(scores.information)
         centre = scores.centre()
         units = (inverse @ scores.away(centre)[..., None])[..., 0]
@@ -178,13 +220,15 @@ class ScoreModel:
         return cls(*models, whites, root, scores.information)
 
     def drawn(self, whites: Sequence[FloatArray], places: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return streams of scores ``(runs, n, nf)``, information and estimates, from innovations and the places that
-        they are of."""
+        """Return streams of scores ``(runs, n, nf)``, information and estimates.
+
+        ``whites``: innovations of both models; ``places``: the rows from which they were drawn.
+        """
         units = self.model.simulated(whites[0])
         score = (self.root[places] @ units[..., None])[..., 0]
         return score, self.information[places], self.followed.simulated(whites[1])
 
 
 def beyond(values: FloatArray, bands: FloatArray | float) -> FloatArray:
-    """Return by how much values are further from zero than bands, with their signs."""
+    """Return by how much values leave bands about zero, with their signs."""
     return np.asarray(np.sign(values) * np.maximum(np.abs(values) - bands, 0.0))

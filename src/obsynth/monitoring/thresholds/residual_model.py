@@ -1,7 +1,10 @@
-"""The model of a residual without faults, driven by disturbances and noise: ``e = V E x - z`` at the samples.
+"""The model of a residual without faults, driven by disturbances and noise, at the samples.
 
-``e+ = Phi e + Gamma d + w - By_h n``, ``r = -C e + Dd d + Dy_h n``, ``e(0) = V E x(0) - z(0) + Gamma_1 n(0)``: held
-d, process noise w gathered over an interval, sensor noise n.
+With the error ``e = V E x - z``,
+
+    e+ = Phi e + Gamma d + w - By_h n,    r = -C e + Dd d + Dy_h n,    e(0) = V E x(0) - z(0) + Gamma_1 n(0),
+
+where d is held between samples, w is the process noise integrated over an interval, and n is the noise of the sensors.
 """
 
 from __future__ import annotations
@@ -32,8 +35,10 @@ from obsynth.verification.error_system import ErrorModel
 
 
 def schur_form(matrix: FloatArray) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return ``T, Q`` with ``A = Q T Q'``, T triangular (complex): its powers keep the eigenvalues, however large
-    entries of A are that cancel."""
+    """Return the complex Schur form ``T, Q`` with ``A = Q T Q'``.
+
+    Powers of T have the right eigenvalues even where large entries of A cancel.
+    """
     if not matrix.size:
         return matrix, matrix
     from scipy.linalg import schur
@@ -44,7 +49,11 @@ def schur_form(matrix: FloatArray) -> tuple[NDArray[Any], NDArray[Any]]:
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance."""
+    """The model ``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults.
+
+    The noise w has unit covariance.  ``fault_C``, ``fault_Dd`` and ``fault_Dw`` give the errors of the fault estimates
+    in the same way.
+    """
 
     A: FloatArray
     C: FloatArray
@@ -56,18 +65,18 @@ class ResidualModel:
     fault_Dd: FloatArray
     fault_Dw: FloatArray
     steps: int
-    start: FloatArray  # ``(n,)``: e there
-    bounds: FloatArray  # ``(nd,)``: largest absolute values of disturbances, or infinite
-    means: FloatArray  # ``(nd,)``: of what is random in them, as deviations
-    deviations: FloatArray
-    steady: tuple[bool, ...]  # nothing but what is random, all the time
+    start: FloatArray  # ``(n,)``: e at the first sample
+    bounds: FloatArray  # ``(nd,)``: largest absolute values of the disturbances, or infinite
+    means: FloatArray  # ``(nd,)``: means of the random parts of the disturbances
+    deviations: FloatArray  # ``(nd,)``: their standard deviations
+    steady: tuple[bool, ...]  # whether a disturbance is random and stationary, without any other part
     errors: ErrorModel  # with the noise of the scenario
     continuous: ContinuousDesign | None = None
-    sampled: IntersampleErrorSystem | None = None  # of a plant on samples, where the continuous one behind it is known
+    sampled: IntersampleErrorSystem | None = None  # of a sampled plant whose continuous model is known
 
     def held(self) -> ResidualModel:
-        """Return the model of a sampled plant for disturbances that are held between samples; a continuous design takes
-        signals as they are."""
+        """Return the model for disturbances that are held between samples; that of a continuous design does not
+        change."""
         return replace(self, sampled=None)
 
     @property
@@ -91,7 +100,10 @@ class ResidualModel:
         return bool(self.Bw.any() or self.Dw.any())
 
     def fault_scales(self) -> FloatArray:
-        """Return ``(nf,)``: deviations of the fault estimates, for disturbances of theirs, or of half their bound."""
+        """Return the deviations of the fault estimates ``(nf,)``.
+
+        A disturbance without a standard deviation counts with half of its bound.
+        """
         half_bounds = np.where(np.isfinite(self.bounds), self.bounds, 0.0) / 2.0
         sizes = np.where(self.deviations > 0.0, self.deviations, half_bounds)
         covariance = output_covariance(
@@ -102,14 +114,25 @@ class ResidualModel:
         )
         scales = np.sqrt(np.abs(np.diag(covariance)))
         largest = float(np.max(scales, initial=0.0))
-        # What nothing disturbs is compared as it is, in the units of what is disturbed most.
+        # An estimate that nothing disturbs has no scale of its own: it takes the largest one.
         return np.where(scales > 0.0, scales, largest if largest > 0.0 else 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ContinuousDesign:
-    """The errors of a continuous design from sample to sample, by the recursion of the module's text, w sensors first;
-    and what a bound at the samples is made of; ``rows`` are watched; ``endless``: the record may have any length."""
+    """The errors of a continuous design from sample to sample, by the recursion in the module's docstring.
+
+    Parameters
+    ----------
+    errors : ErrorModel
+        In continuous time.  In w, the noise of the sensors comes first.
+    dt : float
+        Seconds between samples.
+    rows : slice
+        The rows of the output that are watched.
+    endless : bool
+        Whether a record may have any length.
+    """
 
     errors: ErrorModel
     dt: float
@@ -128,13 +151,13 @@ class ContinuousDesign:
 
     @cached_property
     def between(self) -> IntersampleErrorSystem:
-        """The design on samples; raises `SpecError` where what is watched has no bound."""
+        """The errors between samples; raises `SpecError` where the watched rows have no bound."""
         return IntersampleErrorSystem.of(
             self.plant, self.observer, self.errors.own, self.dt, rows=self.rows, endless=self.endless
         )
 
     def gathered_noise(self, smooth: DescriptorSystem) -> FloatArray:
-        """Return a factor ``(n, m)`` of what process noise adds to the states of the plant in a sample."""
+        """Return a factor ``(n, m)`` of the covariance that process noise adds to the states in an interval."""
         process = smooth.Bw[:, smooth.Bw.any(axis=0)]
         return _gathered(smooth.A, process, self.dt) if process.shape[1] else np.zeros((smooth.nx, 0))
 
@@ -164,24 +187,24 @@ class ContinuousDesign:
 
     @property
     def start_noise(self) -> FloatArray:
-        """From the noise of the first sample to e ``(n, sensors)``."""
+        """Effect of the sensors' noise at the first sample on e ``(n, sensors)``."""
         ramp = first_order_hold(self.observer.Az, self.observer.By, self.dt)[2]
         return np.asarray(ramp @ self.plant.Dw[:, self.sensors])
 
     @property
     def sensor_noise(self) -> tuple[FloatArray, FloatArray]:
-        """From noise drawn as straight lines between samples, to e' and to what is watched."""
+        """Effects of the sensors' noise, linear between samples, on the derivative of e and on the watched rows."""
         return self.errors.noise[:, self.sensors], self.errors.output(self.rows)[3][:, self.sensors]
 
 
 def _gathered(A: FloatArray, noise: FloatArray, dt: float) -> FloatArray:
-    """Return a factor of what noise ``(n, m)`` adds to states in a sample."""
+    """Return a factor of the covariance that white noise ``(n, m)`` adds to the states in an interval."""
     plant = DescriptorSystem(None, A, C=np.eye(len(A)), Bw=noise)
     return np.asarray(discretise(plant, dt).plant.Bw)
 
 
 def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSignals) -> DescriptorSystem:
-    """Return a plant with the noise of a scenario: its own, as often, and that of the sensors."""
+    """Return a plant with the noise of a scenario: a multiple of its own noise, and the noise of the sensors."""
     return plant.replace(
         Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
         Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]),
@@ -192,7 +215,7 @@ def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSign
 def residual_model(
     design: ObserverDesign, scenario: Scenario, *, endless: bool = False, watched: Watched = Watched.RESIDUALS
 ) -> ResidualModel:
-    """Return the model of what is ``watched`` of a design on a scenario, zero but for errors."""
+    """Return the model of the ``watched`` rows of a design on a scenario without faults."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = noisy_plant(plant, scenario, drive)
@@ -200,7 +223,7 @@ def residual_model(
         raise SpecError(f"Design {design.name!r} has no residual to monitor.", path="observer")
     errors = replace(error_model(design), plant=noisy)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
-    # Modes of the plant that the errors hold beside the observer's own state begin at zero in it.
+    # Modes of the plant that the error model has beside the observer's states are zero at the start of the observer.
     begun = np.zeros(errors.observer.order)
     begun[: observer.order] = observer_start(scenario, observer.order)
     initial = errors.own @ (plant.E @ start) - begun
@@ -239,9 +262,9 @@ def residual_model(
 
 
 def largest_disturbances(scenario: Scenario, names: tuple[str, ...], dt: float) -> FloatArray:
-    """Return the largest absolute value of each disturbance ``(nd,)`` in a whole scenario; infinite where it has none.
+    """Return the largest absolute value of each disturbance ``(nd,)`` in a whole scenario; infinite where unbounded.
 
-    Whoever looks at fewer samples has the bounds of all: a disturbance may begin, or grow, after an observer settled.
+    A test of fewer samples needs the same bounds, since a disturbance may begin or grow after the observer has settled.
     """
     return _disturbances(scenario, names, int(scenario.horizon / dt + SAMPLE_SLACK) + 1, dt)[0]
 
