@@ -1,4 +1,4 @@
-"""Learned thresholds: the result of learning from rows without faults, in words and in files."""
+"""Learned thresholds: the result of learning from rows without faults, with its statement and its file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from obsynth.numerics.autoregression import Autoregression
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.gain_set_writing import plain, restored
 
-#: Nothing is known of the share of healthy time in alarm.
+#: The share of healthy time in alarm is unknown.
 NO_HEALTHY_TIME = HealthyTime(0.0, 0.0, 1.0)
 
 LEARNED_KIND = "obsynth learned thresholds"
@@ -40,35 +40,38 @@ LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
 )
 
-#: Share of healthy time in alarm above which thresholds do not hold.
+#: Share of healthy time in alarm above which thresholds are not valid.
 MOST_HEALTHY_TIME = 0.05
 
-#: Faults are followed so many times more slowly than offsets of residuals, which no fault of the design explains.
+#: Estimates of faults are followed so many times more slowly than offsets of the residuals, which no fault explains.
 FAULTS_SLOWER = 2.0
 
-#: Logs from which on their differences show how far offsets of other logs go: the spread of two has one degree of
-#: freedom, and the interval that holds a third one reaches eleven times as far as they are apart.
+#: Least number of logs whose differences show how large the offsets of other logs can be.  The spread of two logs has
+#: one degree of freedom: the 95 % interval of the offset of a third one extends from their mean by eleven times their
+#: distance.
 LOGS_FOR_OFFSETS = 3
 
-#: Thresholds of fewer logs do not tell an offset of another log from a fault that is there from its first row on: an
-#: alarm that stands when so many rows of a run have been decided ends there.  The means of all these rows are what is
-#: usual from then on; a change that came meanwhile has moved them by its share only, and stays an alarm.
+#: Thresholds from fewer logs do not distinguish an offset of another log from a fault that is present from its first
+#: row on.  An alarm that is present when so many rows of a run have been decided therefore ends, and the means of these
+#: rows are usual from then on.  A change within these rows has moved the means by a part of its size only, so that it
+#: stays an alarm.
 OWN_ROWS = (100, 200)
 
-#: Rows over which offsets of residuals are followed where one log does not tell them from drifts, and in a run whose
-#: first rows were taken for what is usual, of which they are an estimate: half as many again as the oldest change that
-#: statistics look for, of which three quarters remain.
+#: Rows over which offsets of residuals are followed: where one log does not distinguish them from drifts, and in a run
+#: whose first rows were taken as usual.  With one and a half times the age of the oldest change that is tested, three
+#: quarters of such a change remain.
 FOLLOWED_ROWS = 1.5 * max(AGES)
 
 
 class WrongPairs(NamedTuple):
-    """Pairs of wrong samples in a row that count as not measured, as each of them would be an alarm."""
+    """Pairs of consecutive wrong samples; they count as not measured, since each of them would cause an alarm."""
 
     number: int
-    chance: float  # how many there are in a row, by chance
+    chance: float  # mean number of pairs per row, by chance
 
     def others(self, every: float) -> float:
-        """Return how many rows there are for each alarm that is none of a pair, of one alarm per ``every`` rows."""
+        """Return the mean number of rows between alarms that no pair causes, if there is one alarm per ``every`` rows
+        in all."""
         return 1.0 / (1.0 / every - self.chance)
 
 
@@ -84,62 +87,66 @@ class LearnedThresholds:
     columns : tuple of str
         Columns of a run that are watched.
     statistics : Statistics
-        Autoregression of these columns, and the directions in which steps are looked for.
+        Autoregression of these columns, and the directions of the steps that are tested.
     levels : FloatArray
         ``(k,)``: level of each statistic.
     every : float
-        Rows per false alarm that were asked for.
+        Mean number of rows between false alarms, as chosen by the user.
     rows, needed : int
-        Rows that were learned from, and those that the rate needs.
+        Number of rows that the thresholds were learned from, and number of rows that this rate needs.
     dt : float, seconds
-        Between these rows.
+        Time between these rows.
     centres, scales : FloatArray
-        ``(nf,)``: means and deviations of the fault estimates there.
+        ``(nf,)``: means and standard deviations of the fault estimates in these rows.
     gains : str
         sha256 of the gain set.
     extrapolated : bool
-        Whether the rate is rarer than what the bootstrap shows.
+        Whether alarms of this rate are rarer than those in the bootstrap.
     left_out : tuple of str
-        Columns that are not watched: nothing changes in them, or they are estimates that remember too much.
+        Columns that are not watched: constant ones, redundant ones, and estimates whose memory is too long for these
+        rows.
     seldom : tuple of str
-        Those of them that most rows lack, as of sensors slower than the rows: a row is whole without them.
+        Those of them that most rows lack, such as those of sensors slower than the rows.  A row is complete without
+        them.
     settling : int
-        Rows at the start of a run in which nothing is decided, as nothing was learned from such rows.
+        Rows at the start of a run that are not decided, since none of them was learned from.
     pairs : WrongPairs
-        Pairs of wrong samples in a row that count as not measured.
+        Pairs of consecutive wrong samples, which count as not measured.
     innovation : float
-        Root mean square of the innovations in the observer's own deviations: one where its covariances are right.
+        Root mean square of the innovations in units of the deviations that the observer states; one if its covariances
+        are right.
     outlier_sizes : FloatArray, optional
-        ``(ny,)``: how far off the outliers of each output are at least, by these rows, in place of what the design
-        says; without them, what it says agrees with these rows.
+        ``(ny,)``: least size of the outliers of each output according to these rows, in place of that of the design;
+        without it, that of the design agrees with these rows.
     lasting : float
-        Mean autocorrelation of the size of the residuals, where it follows itself so that large ones come together and
-        levels are those of a lower rate; otherwise zero.
+        Mean autocorrelation of the size of the residuals if large residuals come in clusters, so that the levels are
+        those of a lower rate; otherwise zero.
     initial_covariance : FloatArray, optional
-        ``(nx, nx)``: of the states at a start that is wherever the plant was in these rows, in place of the design's.
+        ``(nx, nx)``: covariance of the states at a start anywhere in these rows, in place of that of the design.
     repeats : FloatArray, optional
-        ``(ny,)``: from which equal sample in a row on each output counts as not measured, as its sensor may be stuck;
-        infinite where these rows do not show that. Without it, never.
+        ``(ny,)``: number of equal consecutive samples from which on each output counts as not measured, since its
+        sensor may be stuck; infinite where these rows do not show it.  Without it, repeated samples count as measured.
     logs : int
-        How many logs these rows are from.
+        Number of logs that these rows are from.
     healthy_time : HealthyTime
-        The share of healthy rows in alarm, with its interval, on rows that were not learned from.
+        Share of healthy rows in alarm, with its interval, in rows that the levels were not learned from.
     sensor_drift : float
-        Deviations of its noise by which each sensor may drift slowly without an alarm; zero: none is allowed for.
+        Slow drift of each sensor that must not cause an alarm, in deviations of its noise; zero: none is allowed for.
     without_drift : tuple of str
-        Sensors for which none is allowed for all the same, as nothing is known of their noise or of what a drift does.
+        Sensors for which no drift is allowed for nevertheless, since their noise or the effect of a drift is unknown.
     drift_limits : mapping of str to float
-        Where no drift is allowed for: by how many deviations of its noise, of one log below one and of several below
-        four, a slow drift of a sensor alarms for as long as it lasts; with a ``memory``, an offset that is there from
-        the first row on.
+        If no drift is allowed for: the slow drift of a sensor, in deviations of its noise, that causes an alarm for as
+        long as it lasts; with a ``memory``, the offset from the first row on that causes one.  Only limits below one
+        deviation (one log) or four (several) are listed.
     memory : float
-        Rows over which slow offsets of the residuals are followed, and twice those over which faults are, so that they
-        alarm nothing; zero: none is.  One log does not distinguish drifts of a plant from faults that come as slowly.
+        Number of rows over which slow offsets of the residuals are followed, so that they cause no alarm; faults are
+        followed over twice as many.  Zero: neither is followed.  One log does not distinguish drifts of a plant from
+        faults that develop as slowly.
     ranges : LearnedRanges, optional
-        Least and largest values of inputs and outputs in these rows: beyond those of an input levels are raised.
+        Least and largest values of inputs and outputs in these rows.  Levels are raised for inputs beyond them.
     notes : tuple of str
-        What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
-        where inputs move.
+        What a user should look at in these rows: events that raise the levels, outputs that are stuck, errors of the
+        model where inputs move.
 
     Examples
     --------
@@ -187,21 +194,24 @@ class LearnedThresholds:
     memory: float = 0.0
 
     def __repr__(self) -> str:
-        """Return what the thresholds mean, and what is monitored, in a few lines."""
+        """Return the statement of the thresholds, the monitored columns and the notes."""
         lines = [f"{self.statement[0].upper()}{self.statement[1:]}.", f"Monitored: {', '.join(self.columns)}."]
         lines += [f"Left out: {', '.join(self.left_out)}."] if self.left_out else []
         return "\n".join([*lines, *self.notes])
 
     @property
     def holds(self) -> bool:
-        """Whether there were rows enough for the rate that was asked for, and rows that were not learned from are in
-        alarm for `MOST_HEALTHY_TIME` at most."""
+        """Whether there were enough rows for the chosen rate, and healthy rows that were not learned from are in alarm
+        for a share of at most `MOST_HEALTHY_TIME`."""
         return self.rows >= self.needed and self.healthy_time.expected <= MOST_HEALTHY_TIME
 
     @property
     def takes_first_rows(self) -> bool:
-        """Whether the first rows of a run are taken for what is usual in its log, where they alarm: the logs are too
-        few to show which offsets others have, or have none themselves, so that those of a few deviations alarm."""
+        """Whether the first rows of a run are taken as usual in its log if they are in alarm.
+
+        This is so if the logs are too few to show the offsets of other logs, or have no such offsets themselves, so
+        that an offset of a few deviations causes an alarm.
+        """
         return self.logs < LOGS_FOR_OFFSETS or bool(self.drift_limits)
 
     @property
@@ -221,7 +231,7 @@ class LearnedThresholds:
         )
 
     def _rate_in_words(self) -> Iterator[str]:
-        """Yield what is promised of false alarms, and what rows that were not learned from show of it."""
+        """Yield the stated rate of false alarms, and the share of alarms in rows that were not learned from."""
         estimates = self.statistics.estimates
         changes = f", and in changes of {_counted(len(estimates), 'fault')}" if estimates else ""
         yield (
@@ -239,7 +249,7 @@ class LearnedThresholds:
         )
 
     def _drifts_in_words(self) -> Iterator[str]:
-        """Yield which slow drifts of sensors are allowed for, which would alarm, and what one log does not say."""
+        """Yield which slow drifts are allowed for, which cause alarms, and which question one log leaves open."""
         if self.logs == 1:
             yield (
                 "one log does not say how far constants of the plant drift in others: while one is further off than in "
@@ -287,7 +297,7 @@ class LearnedThresholds:
                 )
 
     def _dependence_in_words(self) -> Iterator[str]:
-        """Yield what it means that large residuals come together, and that wrong samples come in pairs."""
+        """Yield the consequences of clustered large residuals, and of wrong samples in pairs."""
         if self.lasting:
             yield (
                 f"the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
@@ -315,7 +325,7 @@ class LearnedThresholds:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it as data."""
+        """Return the thresholds as plain data."""
         model = self.statistics.model
         return {
             "gains": self.gains,
@@ -374,13 +384,14 @@ class LearnedThresholds:
 
 
 def logs_that_do(logs: int, *, joined: str = "") -> str:
-    """Return which normal logs do something, as subject and verb, with what is ``joined`` to the subject between."""
+    """Return "one log does" or "n logs do", the subject and verb of a sentence on normal logs, with the text ``joined``
+    to the subject."""
     without = " without offsets of sensors" if logs >= LOGS_FOR_OFFSETS else ""
     return f"one log{joined} does" if logs == 1 else f"{logs} logs{without}{joined} do"
 
 
 def duration(seconds: float) -> str:
-    """Return seconds in the largest unit of which there is one."""
+    """Return a duration as text, in the largest unit of which it has at least one."""
     name, size = next(((n, s) for n, s in reversed(UNITS.items()) if seconds >= s), ("second", 1.0))
     count = seconds / size
     return f"{count:.3g} {name}{'' if count == 1.0 else 's'}"

@@ -1,4 +1,4 @@
-"""From rows without faults to learned thresholds: which columns are watched, their model, and the levels of alarms."""
+"""Thresholds from rows without faults: the choice of columns, their autoregression, and the levels of alarms."""
 
 from __future__ import annotations
 
@@ -42,21 +42,23 @@ from obsynth.plants.noise import offset_state
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
 
-#: Changes have to be so many times as large to be noticed: without events it was 1.3 at most in 600 logs with normal
-#: innovations, white or coloured, and this much in one of seven logs whose innovations follow Student's t with 4.
-TOLD_LEVEL_FACTOR = 2.0
+#: Events are reported if they raise a level so much that a change must be so many times larger to exceed it.  In 600
+#: logs without events and with normal innovations, white or coloured, the factor was 1.3 at most; it reached this
+#: number in one of seven logs whose innovations follow Student's t distribution with 4 degrees of freedom.
+REPORTED_LEVEL_FACTOR = 2.0
 
-#: Least share of the variance of a column that the others leave unexplained, where estimates and residuals are watched
-#: together: residuals that follow from the estimates say nothing more.
+#: Least share of the variance of a column that the columns before it leave unexplained: a residual that follows from
+#: the estimates is not watched beside them.
 LEAST_NEW = 1e-6
 
-#: A direction whose largest part is this share of its length is that of one column.
+#: A direction is that of a single column if its largest component is at least this share of its length.
 OWN_DIRECTION = 0.99
 
-#: Rows without faults below which nothing is learned.
+#: Least number of rows without faults from which thresholds are learned.
 LEAST_NORMAL = 100
 
-#: Estimates that vary by less than this share of their deviation in a log have most of it from its start.
+#: An estimate that varies within a log by less than this share of its stated deviation is mostly determined at the
+#: start of the log.
 ONE_START_SHARE = 0.5
 
 
@@ -197,7 +199,8 @@ def _validated_levels(
     *,
     validated: bool,
 ) -> tuple[FloatArray, HealthyTime]:
-    """Return levels with one false alarm per ``every`` rows in other parts and logs, and the share of time in alarm."""
+    """Return levels with one false alarm per ``every`` rows in held-out parts and other logs, and the share of healthy
+    time in alarm."""
     held, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
     time = healthy_time(levels, held, every, room)
     parts = held if validated else not_held_out(x, statistics, scores)
@@ -205,7 +208,7 @@ def _validated_levels(
 
 
 def _checked_count(complete: NDArray[np.bool_], missing: str) -> int:
-    """Return how many rows are complete; raise `SpecError`, with what is ``missing``, where they are too few."""
+    """Return the number of complete rows; raise `SpecError`, with the sentence ``missing``, if there are too few."""
     count = int(complete.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
@@ -225,8 +228,11 @@ def _column_choices(
     *,
     with_scores: bool,
 ) -> list[list[int]]:
-    """Return sets of columns of complete rows to watch, the preferred one first: those of ``like``; else estimates and
-    residuals that are independent, then the residuals alone, which are all where scores tell of the faults."""
+    """Return the sets of columns that may be watched, the preferred one first.
+
+    With ``like``, its columns are the only set.  Otherwise the sets are the independent estimates and residuals, and
+    the residuals alone; if there are scores of the faults, only the residuals.
+    """
     if like is not None:
         choices = [[names.index(name) for name in like.columns]]
     else:
@@ -241,8 +247,8 @@ def _column_choices(
 def _fitted_columns(
     choices: list[list[int]], rows: FloatArray, complete: NDArray[np.bool_]
 ) -> tuple[list[int], Autoregression]:
-    """Return the first set of columns whose autoregression needs no more rows than are complete, with that model; the
-    set that needs fewest where none does."""
+    """Return the first set of columns whose autoregression needs no more rows than are complete, with that model; if
+    there is none, the set that needs the fewest."""
     fits = [
         (columns, fitted_autoregression(np.where(complete[:, None], rows[:, columns], np.nan))) for columns in choices
     ]
@@ -252,12 +258,12 @@ def _fitted_columns(
 
 
 class LeftOut(NamedTuple):
-    """An estimate of a fault that is not watched, though it varies."""
+    """An estimate of a fault that is not watched, although it varies."""
 
     name: str
-    largest: float  # of its absolute value in the rows that were learned from
-    is_redundant: bool  # whether the other columns say the same
-    needed: int  # rows with which it would be watched; 0 where no number of them is known
+    largest: float  # largest absolute value in the rows without faults
+    is_redundant: bool  # whether it is a linear combination of other columns
+    needed: int  # number of rows with which it would be watched; 0 where this number is unknown
 
 
 def left_out_estimates(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> list[LeftOut]:
@@ -279,8 +285,11 @@ def left_out_estimates(design: ObserverDesign, learned: LearnedThresholds, rows:
 
 
 def seldom_known(rows: FloatArray, faults: int) -> list[int]:
-    """Return the residuals of rows ``(n, m)``, after so many estimates of ``faults``, without which at least half of
-    the rows are whole: those of sensors that are slower than the rows.  One residual is left."""
+    """Return the residuals that most rows lack, as those of sensors that are slower than the rows.
+
+    Without these residuals at least half of the rows ``(n, m)`` are complete.  The first ``faults`` columns are
+    estimates, which are kept, and so is at least one residual.
+    """
     present = np.isfinite(rows)
     present = present[present.any(axis=1)]
     columns = list(range(rows.shape[1]))
@@ -290,8 +299,11 @@ def seldom_known(rows: FloatArray, faults: int) -> list[int]:
 
 
 def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
-    """Return the faults between which and the offset of a sensor each start divides what it sees, and how much of the
-    deviation that the observer states their estimates vary by in one log: little, as they stay what a start made."""
+    """Return the faults whose estimates hardly change after the start of a log, with their variation.
+
+    The variation is in units of the deviation that the observer states.  Where offsets of sensors are states, the start
+    of a log divides its first residuals between a fault and these offsets, and later rows hardly change that.
+    """
     if scores is None or not isinstance(observer, DAEObserver):
         return {}
     if not any(offset_state(name) in observer.plant.state_names for name in observer.plant.output_names):
@@ -302,8 +314,8 @@ def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
 
 
 class Raised(NamedTuple):
-    """Events that raise levels, and how many times as large a change must be to pass that of a statistic: the one for
-    which this is most."""
+    """Events that raise levels, the statistic whose level they raise most, and the factor by which a change must be
+    larger to exceed that level."""
 
     events: tuple[Event, ...] = ()
     statistic: str = ""
@@ -313,8 +325,10 @@ class Raised(NamedTuple):
 def raised_levels(
     design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray, scores: Scores | None, **options: Any
 ) -> Raised:
-    """Return what in ``rows (n, m)`` raises the levels that were ``learned`` with these ``options`` of
-    `thresholds_from_rows`: no events where none do by much."""
+    """Return the events in ``rows (n, m)`` that raise the ``learned`` levels; none if the levels rise by little.
+
+    ``options`` are those of `thresholds_from_rows` with which the levels were learned.
+    """
     complete = complete_rows(design, learned, rows)
     usual = _usual_scores(scores, complete) if learned.statistics.estimates and scores is not None else None
     x = watched_rows(design, learned, rows)
@@ -341,29 +355,28 @@ def raised_levels(
         most = max(by_statistic, key=lambda name: by_statistic[name])
         return by_statistic[most], most
 
-    # The largest of few parts say little of rare rows: these alone tell whether events stand out.
+    # Levels from held-out parts depend on a few maxima: whether events stand out is decided without these parts.
     inside = thresholds_from_rows(design, rows, scores=scores, like=learned, validated=False, **options)
-    if compared(inside, validated=False)[0] < TOLD_LEVEL_FACTOR:
+    if compared(inside, validated=False)[0] < REPORTED_LEVEL_FACTOR:
         return Raised()
     factor, most = compared(learned, validated=True)
-    return Raised(events, most, factor) if factor >= TOLD_LEVEL_FACTOR else Raised()
+    return Raised(events, most, factor) if factor >= REPORTED_LEVEL_FACTOR else Raised()
 
 
 def watched_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> FloatArray:
-    """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
+    """Return the watched columns of ``rows (n, m)``, NaN in rows that are not complete."""
     places = [watched_names(design).index(name) for name in learned.columns]
     return np.where(complete_rows(design, learned, rows)[:, None], rows[:, places], np.nan)
 
 
 def complete_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
-    """Return in which of ``rows (n, m)`` nothing is missing but what most of them lack ``(n,)``."""
+    """Return which of ``rows (n, m)`` are complete ``(n,)``: no value is missing but those that most rows lack."""
     usual = [name not in learned.seldom for name in watched_names(design)]
     return np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
 
 
 def _usual_scores(scores: Scores, complete: NDArray[np.bool_]) -> Scores | None:
-    """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
-    them."""
+    """Return the scores of complete rows, with zeros for the others; `None` if they do not determine the faults."""
     usual = replace(
         scores,
         score=np.where(complete[:, None], scores.score, 0.0),
@@ -374,9 +387,11 @@ def _usual_scores(scores: Scores, complete: NDArray[np.bool_]) -> Scores | None:
 
 
 def signatures(design: ObserverDesign, places: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return directions ``(s, m)`` of a step in the columns that are watched, of deviations ``sizes (m,)``, and what
-    each shows: a column alone, and what a constant fault of a linear design does to all of them where this is another
-    direction."""
+    """Return the directions ``(s, m)`` in which steps of the watched columns are tested, and the name of each.
+
+    They are the single columns, whose deviations are ``sizes (m,)``, and for a linear design the steady effects of
+    constant faults, if these are not single columns themselves.
+    """
     names = [watched_names(design)[i] for i in places]
     directions = list(np.diag(sizes))
     linear = isinstance(design.observer, LinearObserver) and not follows_later_rows(design)
@@ -400,25 +415,27 @@ def signatures(design: ObserverDesign, places: Sequence[int], sizes: FloatArray)
 
 
 def expects_fault_profiles(design: ObserverDesign) -> bool:
-    """Whether a linear observer expects faults of a course, such as a step, which leave nothing in its residuals once
-    it has followed them."""
+    """Whether a linear observer expects faults of a certain profile, such as a step.
+
+    Once its estimates have converged, such a fault no longer changes the residuals.
+    """
     linear = isinstance(design.observer, LinearObserver) and not follows_later_rows(design)
     return linear and error_model(design).Phi is not None
 
 
 def varying(rows: FloatArray, first: int) -> list[int]:
-    """Return the columns of ``(n, m)`` from the ``first`` on in which anything changes."""
+    """Return the columns of ``(n, m)`` from the ``first`` one on that are not constant."""
     return [i for i in range(first, rows.shape[1]) if float(np.ptp(rows[:, i])) > 0.0]
 
 
 def independent(rows: FloatArray) -> list[int]:
-    """Return the columns of ``(n, m)`` that those before them do not explain."""
+    """Return the columns of ``(n, m)`` that are not linear combinations of those before them and a constant."""
     independent_columns: list[int] = []
     basis = np.zeros((len(rows), 0))
     for i, column in enumerate(rows.T):
         residual = column - column.mean()
         power = float(residual @ residual)
-        # Twice, as once leaves rounding of large parts.
+        # Orthogonalised twice, since rounding errors of large components remain after once.
         for _ in range(2):
             residual = residual - basis @ (basis.T @ residual)
         if power > 0.0 and float(residual @ residual) > LEAST_NEW * power:

@@ -1,9 +1,9 @@
-"""Ranges of inputs and outputs in rows that thresholds were learned from, and what is said of rows beyond them.
+"""Ranges of inputs and outputs in the rows that thresholds were learned from; levels and notes for rows beyond them.
 
-The error of a model grows with the distance of an input from where it was learned.  While an input is beyond its
-range, and for as long as statistics look back, the root of each level is raised by the share of it that follows the
-input (`range_rates`), in proportion to the distance: by nothing where the logs say that there is no such error, in
-proportion where they cannot say.  Outputs raise nothing, as faults move them: they are only named.
+The error of a model grows with the distance of an input from the values that it was learned at.  While an input is
+beyond its range, and as long as the statistics use such rows, the root of each level is raised by a rate
+(`range_rates`) times that distance.  The rate is zero if the logs show that no such error exists, and one if they
+cannot show it.  Outputs raise no level, since a fault may have moved them: a note names them.
 """
 
 from __future__ import annotations
@@ -18,27 +18,33 @@ from obsynth.monitoring.logs.signals import LogSignals
 from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.numerics.arrays import FloatArray, read_only
 
-#: Half of a range is at least this share of its middle: an input that was held is known about where it was held.
+#: Half of a range is at least this share of its middle: the model is taken as known near the value of an input that was
+#: held constant.
 LEAST_HALF = 0.1
 
-#: A signal is named where it is beyond its range by more than this share of its width: noise reaches a bit further in
-#: each log.
+#: A signal is named if it is beyond its range by more than this share of its width, since noise goes a little further
+#: in each log.
 NAMED_BEYOND = 0.05
 
 
 class LearnedRanges(NamedTuple):
-    """Least and largest deviations of signals, known inputs first; outputs as two samples in a row reach them."""
+    """Least and largest deviations of signals from the operating point, known inputs first.
+
+    Those of outputs are values that two consecutive samples reach.
+    """
 
     names: tuple[str, ...]
-    inputs: int  # how many of these are known inputs
+    inputs: int  # number of known inputs
     low: FloatArray
     high: FloatArray
-    point: FloatArray  # what makes deviations absolute
-    rates: FloatArray | None = None  # ``(nu, k)``: shares of the root of each level that follow an input; else one
+    point: FloatArray  # the operating point, which is added to deviations to give absolute values
+    rates: FloatArray | None = None  # ``(nu, k)``: growth of the root of each level with each input; one by default
 
     def middle_and_half(self) -> tuple[FloatArray, FloatArray]:
-        """Return the middle ``(nu,)`` of the range of each input and half of its width, infinite where an input was
-        zero in all rows, so that nothing is known of its effect."""
+        """Return the middle ``(nu,)`` of the range of each input and half of its width.
+
+        Half of the width is infinite if an input was zero in all rows, since its effect is unknown.
+        """
         low, high = self.low[: self.inputs], self.high[: self.inputs]
         middle = 0.5 * (low + high)
         half = np.maximum(0.5 * (high - low), LEAST_HALF * np.abs(middle + self.point[: self.inputs]))
@@ -46,26 +52,29 @@ class LearnedRanges(NamedTuple):
         return np.where(known, middle, 0.0), np.where(known, half, np.inf)
 
     def distances(self, inputs: FloatArray) -> FloatArray:
-        """Return how far ``inputs (..., nu)`` are from the middle of their ranges, in halves of these, with signs."""
+        """Return the signed distances of ``inputs (..., nu)`` from the middles of their ranges, in halves of these."""
         middle, half = self.middle_and_half()
         return np.asarray((inputs - middle) / half)
 
     def beyond_by(self, inputs: FloatArray) -> FloatArray:
-        """Return how many times the half of its range each of ``inputs (nu,)`` is from its middle: one within."""
+        """Return the distance of each of ``inputs (nu,)`` from the middle of its range in halves of that; one within
+        the range."""
         shares = np.abs(self.distances(inputs))
         return np.asarray(np.where(shares > 1.0, shares, 1.0))
 
     def factors(self, beyond_by: FloatArray, count: int) -> FloatArray:
-        """Return by which factor each of so many levels is raised ``(count,)``, where inputs are or have been so many
-        halves of their ranges from the middle, ``beyond_by (nu,)``."""
+        """Return the factor of each level ``(count,)`` for inputs at distances ``beyond_by (nu,)`` from the middles of
+        their ranges, in halves of these."""
         away, rates = beyond_by - 1.0, self.rates
         if rates is None:
             rates = np.ones((len(away), count))
         return np.asarray((1.0 + sum((far * own for far, own in zip(away, rates, strict=True)), np.zeros(count))) ** 2)
 
     def beyond(self, deviations: FloatArray, before: FloatArray) -> NDArray[np.bool_]:
-        """Return in which rows ``(n, nu + ny)``, after one ``before``, each signal is beyond its range by so much that
-        it is named; outputs where the row before is, too."""
+        """Return in which rows ``(n, nu + ny)`` each signal is so far beyond its range that it is named.
+
+        An output must be beyond it in the row before as well; ``before`` is the row before the first one.
+        """
         room = NAMED_BEYOND * (self.high - self.low)
         all_rows = np.vstack([before, deviations])
         with np.errstate(invalid="ignore"):
@@ -80,7 +89,7 @@ class LearnedRanges(NamedTuple):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LearnedRanges:
-        """Return what `as_dict` described."""
+        """Return the ranges from the data that `as_dict` returned."""
         names, inputs = tuple(map(str, data["names"])), int(data["inputs"])
         low, high, point = (np.asarray(data[name], dtype=np.float64) for name in ("low", "high", "point"))
         rates = None if data.get("rates") is None else read_only(np.asarray(data["rates"], dtype=np.float64))
@@ -91,7 +100,7 @@ class LearnedRanges(NamedTuple):
 
 
 def ranges_of_rows(signals: LogSignals, deviations: FloatArray, inputs: int) -> LearnedRanges:
-    """Return the ranges of signals in rows ``(n, nu + ny)`` of which the first ``inputs`` are known."""
+    """Return the ranges of signals in rows ``(n, nu + ny)``; the first ``inputs`` signals are the known inputs."""
     following = deviations[1:]
     rows = (np.minimum(deviations[:-1], following), np.maximum(deviations[:-1], following))
     both = [np.where(np.isfinite(part), part, fill) for part, fill in zip(rows, (-np.inf, np.inf), strict=True)]
@@ -105,7 +114,7 @@ def ranges_of_rows(signals: LogSignals, deviations: FloatArray, inputs: int) -> 
 
 
 class RowsBeyond:
-    """Gathers in which rows of a run signals are beyond their learned ranges."""
+    """Records in which rows of a run each signal is beyond its learned range."""
 
     def __init__(self, ranges: LearnedRanges) -> None:
         count = len(ranges.names)
@@ -118,11 +127,11 @@ class RowsBeyond:
 
     @property
     def memory(self) -> FloatArray:
-        """How many rows ago each input was beyond its range last ``(nu,)``, as far as that counts."""
+        """How many rows ago each input was beyond its range last ``(nu,)``, at most the age of the oldest change."""
         return np.asarray(np.minimum(self._number - self._latest, max(AGES)), dtype=np.float64)
 
     def resume(self, memory: FloatArray) -> None:
-        """Go on from what `memory` was."""
+        """Continue from a saved `memory`."""
         self._latest = self._number - np.asarray(memory).astype(np.int64)
 
     def take(self, deviations: FloatArray, first: int) -> list[tuple[str, ...]]:

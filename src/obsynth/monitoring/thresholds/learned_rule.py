@@ -36,19 +36,22 @@ from obsynth.results.gain_set_writing import digest_of, gain_set_digest, plain
 
 NOTHING = read_only(np.zeros(0))
 
-#: Deviations by which a row moves the offset that is followed, at most: a wrong sample says no more than others.
+#: A row is clipped at so many standard deviations before it moves the followed offset, so that a wrong sample moves it
+#: no more than a large value of the noise does.
 FOLLOWED_MOST = 3.0
 
-#: Deviations of a row that count in the means of a start, at most: one wrong sample moves them by a tenth, and an
-#: offset that is larger, whose mean comes to nearly as much, stays an alarm.
+#: The first rows of a run are clipped at so many deviations before their mean is taken: one wrong sample among a
+#: hundred moves the mean by a tenth of a deviation at most.  If a mean exceeds the second number times this limit, the
+#: offset is larger than the limit, and the alarm stays.
 OWN_MOST, NEARLY_MOST = 10.0, 0.9
 
-#: Where more than this share of a start that is taken for usual was in alarm it stood nearly from the first row on, and
-#: levels rise by so many times what statistics were there (the mean of their roots, so that wrong samples say little):
-#: what is off is known at the inputs of these rows alone, and does something else at others.
+#: If more than this share of the first rows was in alarm when they are taken as usual, the offset was there nearly from
+#: the first row on.  Its effect is then known only at the inputs of these rows and may differ at others, so the levels
+#: rise to the second number times the statistics of these rows (averaged by their roots, so that wrong samples weigh
+#: little).
 MOST_OF_START, ROOM_OF_START = 0.75, 2.0
 
-#: While a level is passed the offset is followed so many times more slowly: what has come quickly stays an alarm.
+#: The offset is followed so many times more slowly while a level is exceeded, so that a quick change stays an alarm.
 SLOWER_IN_ALARM = 10.0
 
 
@@ -57,43 +60,46 @@ class LearnedState(NamedTuple):
 
     past: FloatArray  # ``(order, m)``: rows, latest first
     white: FloatArray  # ``(ages, m)``: whitened rows, latest last
-    means: FloatArray  # exponentially weighted, one row for each weight
-    last: float | None = None
-    taken: int = 0
-    waiting: int = 0  # rows until the effect of the last one in which something was missing has settled
+    means: FloatArray  # exponentially weighted means of whitened rows, one row for each weight
+    last: float | None = None  # time of the last sample
+    taken: int = 0  # number of samples
+    waiting: int = 0  # rows until the last incomplete row no longer affects the prediction
     before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
-    scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
+    scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: score and information of the faults in each row, latest last
     effects: EffectState = NO_EFFECTS  # of faults and sensors on the residuals
-    slow: FloatArray = NOTHING  # ``(m,)``: the offset of whitened rows that is followed
-    centres: FloatArray = NOTHING  # ``(nf,)``: the faults from which changes are looked for
-    alarmed: int = 0  # whether the latest row that was decided passed a level
-    raised: FloatArray = NOTHING  # ``(ages, nu)``: how far beyond their ranges the inputs of rows are, latest last
-    begun: int = 0  # rows since the start that say what is usual in this log, up to the last of `OWN_ROWS`
-    own: FloatArray = NOTHING  # ``(m + nf,)``: sums over these of whitened rows, and of estimates of faults that walk
-    ended: int = 0  # so many of them were taken for what is usual in this log, which ended an alarm
-    decided: int = 0  # whether a row has been decided: the warm-up is over
-    stood: int = 0  # how many rows of the start were in alarm
-    roots: float = 0.0  # sum of the roots of their statistics
-    room: float = 1.0  # by which levels are raised, as an alarm of the start was ended
-    swings: Swings = Swings()  # of means of whitened rows, and of likelihood ratios, to both sides
+    slow: FloatArray = NOTHING  # ``(m,)``: the followed offset of whitened rows
+    centres: FloatArray = NOTHING  # ``(nf,)``: values of the faults from which changes are measured
+    alarmed: int = 0  # whether the latest decided row exceeded a level
+    raised: FloatArray = NOTHING  # ``(ages, nu)``: how far inputs were beyond their ranges in each row, latest last
+    begun: int = 0  # number of first rows that are averaged, up to the last of `OWN_ROWS`
+    own: FloatArray = NOTHING  # ``(m + nf,)``: sums over the first rows, of whitened values and of fault estimates
+    ended: int = 0  # number of first rows whose means were taken as usual, which ended an alarm; 0: none were
+    decided: int = 0  # whether a row has been decided, so that the warm-up is over
+    stood: int = 0  # number of first rows in alarm
+    roots: float = 0.0  # sum of the roots of their largest statistics
+    room: float = 1.0  # factor of all levels since an alarm of the first rows was ended
+    swings: Swings = Swings()  # swings to both sides of the means of whitened rows and of likelihood ratios
 
 
 class _Row(NamedTuple):
-    """What a sample says to the rule, and how far it counts."""
+    """The columns of a sample, and how much evidence they may add."""
 
-    values: FloatArray | None  # residuals and estimates, NaN where there is none
-    complete: bool  # whether all columns are there that are there usually
-    evidence: FloatArray | None  # ``(m,)``: watched columns, filled where one may decide by the others
-    counts: bool  # whether it adds evidence
-    most: float  # how far its whitened values may be from zero
-    varying: bool  # whether the gain follows what is measured
+    values: FloatArray | None  # estimates and residuals, NaN where one is missing
+    complete: bool  # whether no column is missing but those that most rows lack
+    evidence: FloatArray | None  # ``(m,)``: watched columns; missing ones are filled in if the others may decide
+    counts: bool  # whether the sample adds evidence
+    most: float  # largest norm of its whitened values
+    varying: bool  # whether the observer's gain depends on which values are measured
 
 
 def shares_of_partial_scores(learned: LearnedThresholds) -> FloatArray:
-    """Return by which share the score of each fault ``(nf,)`` counts of a sample without all outputs.
+    """Return the factor of the score of each fault ``(nf,)`` in a sample that lacks outputs.
 
-    Where covariances are too large for the rows that were learned from, scores of whole samples and the levels of
-    changes are smaller than information says, but not the scores of other outputs alone."""
+    Covariances of the observer that are too large for the rows without faults make the scores of complete samples
+    smaller than their information states, and with them the learned levels of changes.  The scores of the other outputs
+    alone need not be smaller.  The factor is the root of the learned level divided by the level that follows from the
+    information, and one at most.
+    """
     faults = len(learned.statistics.estimates)
     if not faults:
         return NOTHING
@@ -103,37 +109,38 @@ def shares_of_partial_scores(learned: LearnedThresholds) -> FloatArray:
 
 
 def follow_shares(memory: float) -> tuple[float, float]:
-    """Return by which share of a row the offset of residuals follows it, and by which while there is an alarm."""
+    """Return the weights of a new row in the followed offset of the residuals: without an alarm, and during one."""
     return (1.0 / memory, 1.0 / (SLOWER_IN_ALARM * memory)) if memory else (0.0, 0.0)
 
 
 class LearnedRule(Rule):
-    """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
-    be decided, is as the autoregression predicts it, and one of the warm-up is only what the next ones are predicted
-    from: none of them adds evidence, or takes any away.  Where the gain follows what is measured, a sample whose
-    outputs say nothing by themselves is decided so, too.
+    """The largest of all learned statistics in units of its level, row by row.
 
-    Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
-    moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
-    observer's own covariance, which has grown, makes of their innovation, by as much as it was wrong in the rows that
-    were learned from.  In that row itself the innovations of
-    ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
-    likely.
+    The autoregression predicts a row that is missing, or that may not be decided.  Rows of the warm-up are only used to
+    predict later ones.  Such rows neither add evidence nor take any away.
 
-    A sample that lacks outputs says of a fault what the others do, at a scale that was not learned: what the level of
-    a change is below that of scores as large as their information says is taken from it.
+    All observers but the linear ones have gains that depend on which values are measured.  With them
 
-    Of a linear observer with a column that is predicted closely, as an estimate that follows from the residuals before,
-    rows that are predicted from a missing one, from one of the warm-up, or from rows before the first one, add no
-    evidence, as none of these was learned from.
+    - a sample whose outputs give no evidence of their own is decided by the rows before it;
+    - a missing sample changes the estimates in a way that was not learned.  The norm of later whitened rows, as long as
+      their prediction uses the missing one, is therefore limited to that of the innovation whitened by the observer's
+      own covariance, which has grown; that norm is corrected by its mean size in the rows without faults;
+    - innovations that belong to one sensor each (``by_sensor``) keep their distribution when others are missing: they
+      decide the row, and the missing ones take their conditional means;
+    - the scores of faults in a sample that lacks outputs are reduced (`shares_of_partial_scores`), since their size was
+      not learned.
 
-    With a ``memory`` changes are looked for from where whitened rows, and estimates of faults, have been of late: their
-    exponential means follow them, ten times more slowly after a row in alarm.  With thresholds of few logs an alarm
-    that stands after the first `OWN_ROWS` rows of a run ends there: their means take the place of what those logs had,
-    and are followed from then on; where nearly all of them were in alarm, levels rise by what it reached.
+    A linear observer recovers from a gap before rows are decided.  If one of its columns is predicted closely, as an
+    estimate that follows from earlier residuals, rows that are predicted from a missing row, from one of the warm-up or
+    from before the first row add no evidence, since no such rows were learned from.
 
-    Where means of whitened rows and likelihood ratios swing to both sides their levels rise by what they reach there:
-    the noise has become slower than it was, as a fault would stay on one side."""
+    With a ``memory``, changes are measured from exponential means of recent whitened rows and fault estimates.  These
+    means follow more slowly after a row in alarm (`SLOWER_IN_ALARM`).  If the thresholds were learned from few logs, an
+    alarm that is present after the first `OWN_ROWS` rows of a run ends there: the means of these rows replace the
+    learned ones and are followed from then on.  If most of these rows were in alarm, the levels rise as well.
+
+    If means of whitened rows or likelihood ratios swing to both sides, their levels rise with the swings: a fault would
+    stay on one side, so that the noise has become slower."""
 
     def __init__(
         self,
@@ -186,22 +193,23 @@ class LearnedRule(Rule):
         )  # fmt: skip
 
     def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
-        """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
+        """Return the state after a sample, and the decision: the largest statistic in units of its level, the threshold
+        one, and the likeliest fault."""
         missing = 0 if state.last is None else max(round((sample.time - state.last) / self.learned.dt) - 1, 0)
         state = self._begun(state, sample, missing)
         row = self._row(state, sample)
         if not row.complete and row.varying:
             state = state._replace(waiting=self._model.order + 1)
         state = self._with_row(state._replace(waiting=max(state.waiting - 1, 0)), row, sample)
-        # Without evidence of its own a sample with fewer outputs is decided by the rows before it: an alarm that
-        # stands is not ended by outputs that are left out.
+        # A sample with fewer outputs and no evidence of its own is decided by the rows before it, so that missing
+        # outputs do not end an alarm.
         by_rows_before = row.varying and sample.deciding and state.taken > self.learned.settling
         if row.values is None or not (row.counts or by_rows_before):
             return state, RuleOutput(math.nan, math.nan)
         return self._decision(state, row, row.values, sample)
 
     def _begun(self, state: LearnedState, sample: Sample, missing: int) -> LearnedState:
-        """Return the state with the rows that are ``missing`` before a sample, and what is counted of it."""
+        """Return the state with the ``missing`` rows before a sample, and with its time, scores and inputs."""
         for _ in range(min(missing, max(AGES))):
             state, _ = self._added(state, None)
         follows_nothing = missing > 0 or state.last is None
@@ -217,11 +225,11 @@ class LearnedRule(Rule):
         return state._replace(raised=self._raised(state.raised, sample, missing))
 
     def _is_whole(self, values: FloatArray | None) -> bool:
-        """Return whether all that may be watched is there, but what most rows lack."""
+        """Return whether no value is missing but those that most rows lack."""
         return values is not None and bool(np.isfinite(values[self._usual]).all())
 
     def _row(self, state: LearnedState, sample: Sample) -> _Row:
-        """Return what a sample says, and how far it counts."""
+        """Return the columns of a sample, and how much evidence they may add."""
         values = watched_values(sample.residuals, sample.observation)
         complete = sample.deciding and self._is_whole(values)
         evidence = None
@@ -236,8 +244,9 @@ class LearnedRule(Rule):
         return _Row(values, complete, evidence, counts, most, varying)
 
     def _with_row(self, state: LearnedState, row: _Row, sample: Sample) -> LearnedState:
-        """Return the state with a row, or with what the rows before it predict where it says nothing."""
-        # What follows a warm-up is predicted from its last rows: from the mean, a slow estimate would come as a jump.
+        """Return the state with a row, or with its prediction from the rows before it if it cannot be used."""
+        # Rows after the warm-up are predicted from its last rows: a prediction from the mean would make a slow estimate
+        # look like a jump.
         kept = row.varying or not state.decided
         if row.values is None or not (
             row.complete or (kept and (row.counts or np.isfinite(row.values[self._places]).all()))
@@ -260,7 +269,7 @@ class LearnedRule(Rule):
         self, state: LearnedState, row: _Row, values: FloatArray, sample: Sample
     ) -> tuple[LearnedState, RuleOutput]:
         """Return the state after a row of ``values`` that is decided, and the decision."""
-        # Products of numbers that overflow have passed any level.
+        # A statistic that overflows exceeds every level.
         with np.errstate(all="ignore"):
             ratios, sides = self._likelihood_ratios(state)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
@@ -276,7 +285,7 @@ class LearnedRule(Rule):
         reached = largest * state.room
         state = self._roomy(state._replace(alarmed=int(largest > 1.0)), reached)
         state = self._own_of_start(state, sample.observation, reached, counts=row.counts)
-        # Faults are compared without what their slow offsets explain: each has its own.
+        # To name a fault, changes are compared without their bands: each fault has a band of its own.
         fault = self._fault(values, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
         ranking = None
         if self.effects is not None and largest > 1.0:
@@ -290,14 +299,15 @@ class LearnedRule(Rule):
     def _followed(
         self, state: LearnedState, observation: Any, seen: Seen | None = None, share: float = 0.0
     ) -> LearnedState:
-        """Return the state with the effects of faults and sensors on a row, of which so much was ``seen``, and such a
-        ``share`` counts."""
+        """Return the state with the effects of faults and sensors on a row, of which the columns ``seen`` were
+        measured, and whose whitened values were scaled by ``share``."""
         if self.effects is None:
             return state
         return state._replace(effects=self.effects.step(state.effects, observation, state.white[-1], seen, share))
 
     def _raised(self, before: FloatArray, sample: Sample, missing: int) -> FloatArray:
-        """Return how far inputs are beyond their ranges ``(ages, nu)`` with a sample, after some that are missing."""
+        """Return how far the inputs of the last rows are beyond their ranges ``(ages, nu)``, with those of a sample and
+        of the ``missing`` ones before it."""
         if self._ranges is None:
             return before
         now = np.ones(self._ranges.inputs) if sample.inputs is None else self._ranges.beyond_by(sample.inputs)
@@ -307,8 +317,11 @@ class LearnedRule(Rule):
     def _swung(
         self, state: LearnedState, weights: FloatArray, ratios: FloatArray, row: float, time: float
     ) -> tuple[LearnedState, FloatArray]:
-        """Return the state after a row with signed likelihood ``ratios (k,)``, and levels, those of slow changes raised
-        where they swing; ``weights``: of squared means, ``row``: the statistic of the row alone."""
+        """Return the state after a row, and the levels; those of slow changes are raised with their swings.
+
+        ``weights`` are those of the squared means, ``ratios (k,)`` the likelihood ratios with the signs of the changes,
+        and ``row`` is the statistic of this row alone (T2).
+        """
         levels = self.learned.levels * self._factors(state) * state.room
         slow = slice(1, 1 + len(weights) + len(ratios))
         of_means, of_ratios = np.split(levels[slow], [len(weights)])
@@ -318,13 +331,13 @@ class LearnedRule(Rule):
         return state._replace(swings=swings), levels
 
     def _factors(self, state: LearnedState) -> FloatArray | float:
-        """Return by which factor each level is raised by the inputs of the rows that statistics look back to."""
+        """Return the factor of each level for inputs beyond their ranges, over the rows that the statistics use."""
         if self._ranges is None:
             return 1.0
         return self._ranges.factors(state.raised.max(axis=0, initial=1.0), len(self.learned.levels))
 
     def _scored(self, state: LearnedState, observation: Any, missing: int, *, whole: bool) -> LearnedState:
-        """Return the state with what a sample says of the faults, ``whole``: with all usual outputs."""
+        """Return the state with the scores of the faults from a sample; ``whole``: with no usual output missing."""
         if self._walk is None or not isinstance(observation, Evidence):
             return state
         before, scores = sample_score(state.before, observation, self._walk, missing + 1)
@@ -335,11 +348,11 @@ class LearnedRule(Rule):
         return state._replace(before=before, scores=newest_scores)
 
     def _share(self, state: LearnedState) -> float:
-        """Return by which share of a row offsets follow it: also those that a start was taken for."""
+        """Return the weight of a new row in the followed offsets, learned ones or those taken from the first rows."""
         return self._shares[int(state.ended > 0)][state.alarmed]
 
     def _centred(self, state: LearnedState, observation: Any) -> LearnedState:
-        """Return the state whose centres of the faults have followed the estimates."""
+        """Return the state in which the centres of the faults have followed the estimates."""
         share = self._share(state)
         if self._walk is None or not share or not isinstance(observation, Evidence):
             return state
@@ -351,13 +364,17 @@ class LearnedRule(Rule):
 
     @staticmethod
     def _roomy(state: LearnedState, reached: float) -> LearnedState:
-        """Return the state whose levels fall from where the start raised them, to what statistics still ``reached``."""
+        """Return the state in which levels that the first rows raised fall again, but not below what the statistics
+        ``reached`` in this row."""
         kept = (1.0 - 1.0 / SWING_MEMORY) * state.room
         return state._replace(room=max(kept, min(reached, state.room), 1.0))
 
     def _own_of_start(self, state: LearnedState, observation: Any, reached: float, *, counts: bool) -> LearnedState:
-        """Return the state after a row that may be one of the first of a log: where an alarm stands once these are
-        enough, they are what is usual in this log, and the rows before say nothing against that."""
+        """Return the state after a row that may be one of the first of a run.
+
+        If there is an alarm when enough rows have come, their means are taken as usual from then on, and the evidence
+        of the rows until then is deleted.
+        """
         if not (self.learned.takes_first_rows and counts) or state.begun >= OWN_ROWS[-1]:
             return state
         white = np.clip(np.nan_to_num(state.white[-1] + state.slow), -OWN_MOST, OWN_MOST)
@@ -383,7 +400,7 @@ class LearnedRule(Rule):
         )  # fmt: skip
 
     def _likelihood_ratios(self, state: LearnedState) -> tuple[FloatArray, FloatArray]:
-        """Return twice the log likelihood ratio of a step or ramp of each shape at its likeliest age, and its sign."""
+        """Return twice the log likelihood ratio of each step and ramp at its likeliest age, and the signs of these."""
         fits = self._templates @ state.white.ravel()
         squares = np.maximum(np.abs(fits) - self._effects, 0.0) ** 2
         likeliest = np.argmax(squares.reshape(-1, len(AGES)), axis=1)
@@ -391,25 +408,27 @@ class LearnedRule(Rule):
         return squares[places], np.sign(fits[places])
 
     def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
-        """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,
-        ``(ages, nf)``."""
+        """Return twice the log likelihood ratios ``(ages, nf)`` of changes of each age and fault by more than
+        ``bands``."""
         if self._walk is None:
             return np.zeros((1, 0))
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
-        # Before any sample that said something of a fault the quotient is none.
+        # The ratio is zero as long as no sample has had information on the fault.
         with np.errstate(all="ignore"):
             return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
 
     def _squares(self, state: LearnedState, observation: Any) -> FloatArray:
-        """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
+        """Return the squared distances of the fault estimates from their centres, in units of their deviations,
+        ``(nf,)``."""
         if self._walk is None or not isinstance(observation, Evidence):
             return np.zeros(0 if self._walk is None else len(self._walk))
         away = beyond(observation.theta - state.centres, self._bands)
         return np.asarray(away**2 / np.diag(observation.parameter_covariance))
 
     def _fault(self, watched: FloatArray, ratios: FloatArray) -> int | None:
-        """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
+        """Return the fault whose step or ramp is likeliest; if that is none of a fault, the one whose estimate is
+        furthest from its centre."""
         names, count = self.learned.columns, len(self.learned.scales)
         signature = self.learned.statistics.signature_names[
             int(np.argmax(ratios)) % len(self.learned.statistics.signature_names)
@@ -423,14 +442,14 @@ class LearnedRule(Rule):
         )
 
     def _predicted(self, state: LearnedState) -> FloatArray:
-        """Return what the autoregression says of the next row."""
+        """Return the prediction of the next row by the autoregression."""
         model = self._model
         rows = zip(model.A, state.past, strict=True)
         return np.asarray(model.offset + sum((a @ row for a, row in rows), np.zeros(model.channels)))
 
     def _completed(self, state: LearnedState, values: FloatArray, *, complete: bool) -> FloatArray | None:
-        """Return the watched values of a row; where some are missing, as those of sensors that are there make them most
-        likely, and `None` without any."""
+        """Return the watched values of a row; missing ones take their conditional means, given the others.  The result
+        is `None` if the others may not decide the row."""
         x = values[self._places]
         measured = self._residual & np.isfinite(x)
         if complete or not (self.by_sensor and measured.any()):
@@ -447,8 +466,19 @@ class LearnedRule(Rule):
     def _added(
         self, state: LearnedState, x: FloatArray | None, most: float = 0.0, evidence: FloatArray | None = None
     ) -> tuple[LearnedState, float]:
-        """Return the state after a row, or after one that is as predicted (`None`): of a norm of ``most`` at most, with
-        its values as ``evidence`` (``(m,)``, by default the row itself); and the share of it that is left."""
+        """Return the state after a row, and the factor by which its whitened values were scaled.
+
+        Parameters
+        ----------
+        state : LearnedState
+            The state before.
+        x : FloatArray or None
+            ``(m,)``: the row, from which later ones are predicted; `None`: as predicted.
+        most : float, optional
+            Largest norm of the whitened values.
+        evidence : FloatArray, optional
+            ``(m,)``: the values that are whitened; by default the row itself.
+        """
         model, predicted = self._model, self._predicted(state)
         evidence = x if evidence is None else evidence
         with np.errstate(over="ignore", invalid="ignore"):
@@ -459,7 +489,7 @@ class LearnedRule(Rule):
         slow = state.slow
         if self._has_offset and evidence is not None and most:
             e = e - slow
-            # A wrong sample moves the offset no more than noise does.
+            # Clipped, so that a wrong sample moves the offset no more than noise does.
             slow = slow + self._share(state) * np.clip(np.nan_to_num(e), -FOLLOWED_MOST, FOLLOWED_MOST)
         shares = np.array(FORGETTING)[:, None]
         past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
@@ -467,7 +497,7 @@ class LearnedRule(Rule):
         return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means, slow=slow), share
 
     def restart(self, state: LearnedState, skipped: int = 0) -> LearnedState:
-        """Keep everything: rows that are missing are predicted over."""
+        """Keep the state: missing rows are predicted."""
         return state
 
     def options(self) -> Any:
@@ -476,8 +506,10 @@ class LearnedRule(Rule):
 
 
 def learned_monitor(design: ObserverDesign, learned: LearnedThresholds, *, sensor_faults: bool = True) -> Monitor:
-    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design. Without
-    ``sensor_faults`` an alarm is one of the faults of the design."""
+    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design.
+
+    Without ``sensor_faults`` only the faults of the design are considered as causes of an alarm.
+    """
     if learned.gains != gain_set_digest(design):
         raise SpecError("The thresholds were learned with another gain set: learn them again.", path="normal")
     observer, names = design.observer, watched_names(design)

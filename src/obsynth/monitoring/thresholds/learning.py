@@ -1,4 +1,4 @@
-"""From logs without faults to learned thresholds: the observer runs on them, and its residuals are learned from."""
+"""Learning thresholds from logs without faults: the observer runs on the logs, and levels follow from its residuals."""
 
 from __future__ import annotations
 
@@ -46,14 +46,15 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.number_texts import duration
 
-#: Deviations of its noise below which an offset of a sensor that alarms is told of one log, and of several: by so much
-#: sensors are off in healthy logs, and logs that hold such offsets raise the levels above what they do.
+#: An offset of a sensor that causes an alarm is reported if it is less than so many deviations of its noise: for
+#: thresholds from one log, and from several.  Sensors of healthy logs have offsets of this size, and logs with such
+#: offsets raise the levels above their effects.
 FEW_DEVIATIONS, USUAL_DEVIATIONS = 1.0, 4.0
 
-#: One false alarm in so many rows, where nothing else is asked for.
+#: Default rate of false alarms.
 FALSE_ALARM_RATE = "1 per 1000 rows"
 
-#: Deviations of its noise by which each sensor may drift, where nothing else is asked for.
+#: Default of the drift that each sensor may have, in deviations of its noise.
 SENSOR_DRIFT = 0.0
 
 
@@ -77,49 +78,51 @@ def learn_thresholds(
 ) -> LearnedThresholds:
     """Learn the thresholds of a design from rows of its plant without faults.
 
-    Offsets, covariance and colour of the fault estimates and residuals are taken from the rows, whatever the design
-    assumes of them: they are whitened by a fitted autoregression and watched by Hotelling's T2, exponentially weighted
-    means and likelihood ratios of steps; where faults are parameters that walk, by likelihood ratios of a change of
-    each fault and by its estimate, too.  Levels come from a bootstrap of all that is estimated, so that a short log
-    gives higher ones.
+    Offsets, covariance and colour of the fault estimates and residuals are estimated from the rows, and not taken from
+    the design.  A fitted autoregression whitens them.  An alarm is raised by Hotelling's T2, by exponentially weighted
+    means or by likelihood ratios of steps and ramps.  If the design models the faults as random walks, likelihood
+    ratios of a change of each fault and the fault's estimate are tested as well.  The bootstrap of the levels repeats
+    every estimation, so that a short log gives higher levels.
 
     Parameters
     ----------
     design : ObserverDesign
         Of any method.
     data : path, text stream, pandas.DataFrame or list of these
-        As for `obsynth.run_on_data`: a log without faults; or several, of which each is a run of its own, or the folder
-        that they are in.  Starts, set points and offsets of sensors differ from log to log: how far, is learned from
-        three and more.
+        As for `obsynth.run_on_data`: a log without faults, several logs, each of which is a run of its own, or the
+        folder with these logs.  Starts, set points and offsets of sensors differ from log to log; three or more logs
+        show how much.
     false_alarms : str or float, optional
-        Rate of false alarms, such as ``"1 per week"`` or ``"2 per 1000 rows"``, or a number of them per row.  Alarms
-        closer than 20 rows are one.
+        Rate of false alarms, such as ``"1 per week"`` or ``"2 per 1000 rows"``, or their number per row.  Alarms less
+        than 20 rows apart count as one.
     rows : str, slice or pair of int, optional
-        Rows of each log that are free of faults, as Python counts; all by default.  The observer runs over all before.
+        Rows of each log that are free of faults, counted as in Python; all by default.  The observer also runs over the
+        rows before them.
     columns, time_column, time_zone, time_unit, scales, gap, warm_up
         As for `obsynth.run_on_data`.
     seed : int, optional
-        Of the bootstrap.
+        Seed of the bootstrap.
     units_as_is : bool, optional
-        As for `obsynth.run_on_data`: by default a log in which one signal is likely in another unit than the plant's is
-        refused, as its levels would be those of the wrong unit.
+        As for `obsynth.run_on_data`: by default a log is refused if one of its signals is likely in another unit than
+        that of the plant, since the levels would be in the wrong unit.
     sensor_drift : float, optional
-        Deviations of its noise by which each sensor may drift slowly without an alarm, whether the logs show that or
-        not; 0: none.  The noise is the one that the design states, or else that of the log; the statement names sensors
-        for which there is neither, and which get no room.
+        Slow drift that each sensor may have without an alarm, in deviations of its noise, whether or not the logs show
+        such drifts; 0: none.  The noise is that of the design, or else that of the log.  The statement names sensors
+        for which neither is known; no drift of these is allowed for.
 
     Returns
     -------
     LearnedThresholds
-        For `obsynth.online_monitor`; ``statement`` says what they mean, and ``holds`` whether the rows suffice;
-        ``notes`` name rows to be looked at: events that raise the levels, outputs that are stuck, and whether errors of
-        the model where inputs move raise them.
+        For `obsynth.online_monitor`.  ``statement`` says what the thresholds mean, and ``holds`` whether the rows
+        suffice.  ``notes`` name what a user should look at: events that raise the levels, outputs that are stuck, and
+        errors of the model where inputs move.
 
     Raises
     ------
     SpecError
-        The log cannot be read, holds too few rows, or nothing moves in it; the rate is none; a signal is likely in
-        another unit than the plant's; a ``sensor_drift`` where no sensor has noise, or the design integrates.
+        The log cannot be read, has too few rows, or no signal changes in it; ``false_alarms`` is not a rate; a signal
+        is likely in another unit than that of the plant; ``sensor_drift`` is positive, but no sensor has noise, or the
+        design integrates.
 
     References
     ----------
@@ -144,7 +147,7 @@ def learn_thresholds(
     >>> learned.columns
     ('fhat[f1]',)
     """
-    # Both are refused before the log is read.
+    # A design or a rate that is refused is refused before the log is read.
     watched_names(design)
     rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
     if time_column is not None:
@@ -204,8 +207,11 @@ def _long_warm_up(runs: NormalRuns, logs: NormalLogs) -> str:
 
 
 def _memory(learned: LearnedThresholds, logs: NormalLogs) -> float:
-    """Return over how many rows slow offsets of residuals are followed: where one log does not tell them from drifts,
-    and room for these is not given."""
+    """Return over how many rows slow offsets of residuals are followed; zero: they are not.
+
+    They are followed if there is one log only, which does not distinguish faults from drifts, and if no sensor drift is
+    allowed for or changes of faults are tested.
+    """
     return FOLLOWED_ROWS if len(logs.ends) == 1 and (learned.statistics.estimates or not learned.sensor_drift) else 0.0
 
 
@@ -217,7 +223,8 @@ def _notes_of_output(
     learned: LearnedThresholds,
     options: Mapping[str, Any],
 ) -> list[str]:
-    """Return which of the ``chosen`` rows of logs raise levels or are stuck, and which estimates are not watched."""
+    """Return notes on ``chosen`` rows of logs that raise levels, on outputs that are stuck, and on estimates that are
+    not watched."""
     raised = raised_levels(design, learned, output.watched, output.scores, **options)
     return [
         *notes_of_normal_rows(
@@ -228,7 +235,7 @@ def _notes_of_output(
 
 
 def _notes_of_starts(design: ObserverDesign, output: ObserverOutput, learned: LearnedThresholds) -> tuple[str, ...]:
-    """Return which faults stay what the start of a log made of them."""
+    """Return notes on faults whose estimates hardly change after the start of a log."""
     scores = output.scores if learned.statistics.estimates else None
     return notes_of_starts(divided_at_starts(design.observer, scores))
 
@@ -241,15 +248,17 @@ def _ranges(
     learned: LearnedThresholds,
     logs: Sequence[slice],
 ) -> LearnedRanges:
-    """Return the ranges of signals in the rows that were learned from, and how far each level follows the inputs."""
+    """Return the ranges of signals in the rows without faults, with the rates at which levels grow beyond them."""
     ranges = ranges_of_rows(signals, deviations[np.unique(output.numbers)], signals.inputs)
     distances = ranges.distances(deviations[output.numbers, : signals.inputs])
     return ranges._replace(rates=range_rates(distances, white, learned, output.scores, logs))
 
 
 def _drifts(runs: NormalRuns, logs: NormalLogs, offsets: FloatArray, most: int = DRIFT_ROWS) -> SensorDrifts:
-    """Return what drifts of sensors by ``offsets (ny,)`` do to the rows that a design makes of normal logs, from
-    ``most`` of these where it has to run for it."""
+    """Return the effects of sensor drifts by ``offsets (ny,)`` on the watched columns.
+
+    For a nonlinear observer they are computed by running it on ``most`` rows of the longest log.
+    """
     if not offsets.any():
         raise SpecError(
             "No noise of any sensor is stated, and the log shows none: a drift in deviations of it is nothing. State "
@@ -273,8 +282,11 @@ def _drifts(runs: NormalRuns, logs: NormalLogs, offsets: FloatArray, most: int =
 def _drift_limits(
     runs: NormalRuns, logs: NormalLogs, offsets: FloatArray, learned: LearnedThresholds
 ) -> dict[str, float]:
-    """Return by how many of its deviations, ``offsets (ny,)``, a slow drift of a sensor alarms for as long as it lasts,
-    where these are few: one log says nothing of those of other logs, and several say nothing where they have none."""
+    """Return the slow drift of each sensor that causes an alarm for as long as it lasts, in units of ``offsets (ny,)``.
+
+    Only small ones are returned: one log does not show the drifts of other logs, and several logs show none if they
+    have none.
+    """
     try:
         drifts = _drifts(runs, logs, offsets, LIMIT_ROWS)
     except SpecError:
