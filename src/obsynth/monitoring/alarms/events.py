@@ -1,6 +1,4 @@
-"""Alarms as events: from when to when, which fault, how large, on what evidence; and rows that were without a
-decision.
-"""
+"""Alarms as events: their times, the fault, its size and the evidence; and how many rows had no decision."""
 
 from __future__ import annotations
 
@@ -19,44 +17,44 @@ from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.results.number_texts import duration
 
-#: What stands for the status of rows that are well, but in which the monitor decides nothing.
+#: Status in the summary of rows without missing samples in which the monitor nevertheless decides nothing.
 NO_DECISION = "undecided"
 
-#: What stands for the fault of an alarm whose evidence does not distinguish the faults.
+#: Name of the fault of an alarm whose evidence does not distinguish the faults.
 NOT_DISTINGUISHED_YET = "not distinguished yet"
 
-#: Monitors of innovations: an alarm of theirs contradicts the stated noise and random walks, on which deviations rest.
+#: Monitors of innovations.  Their alarms contradict the stated noise and random walks, from which deviations follow.
 CONTRADICTING = ("nis", "learned")
 
-#: What a summary says where such an interval is in its table.
+#: Note below a table with an interval that such an alarm contradicts.
 NOT_VALID = (
     "Not valid: the alarm contradicts the noise and random walks that the interval assumes, so that the fault may lie "
     "outside."
 )
 
-#: What is said of names where an alarm lasted for longer than changes are looked for.
+#: Note on the names of alarms that last longer than the oldest change that is looked for.
 NAMED_BY_THE_FIRST = (
     "An alarm is named by what began it: another fault that came while it stood, or soon after, has an alarm of its "
     "own where it is more than what errors of the model leave of the first (a seventh of its effect); a smaller one "
     "may have no name here. Its time is where the statistic of the output rises again."
 )
 
-#: Rows in alarm without a fault that fits after which an alarm is shelved: the oldest change that is looked for.
+#: An alarm that no fault explains is shelved after this many rows, the age of the oldest change that is looked for.
 SHELVED_AFTER = max(AGES)
 
-#: What is said of one.
+#: How a shelved alarm is named.
 SHELVED = "shelved: unexplained offset since {}"
 
-#: What is said of an alarm that goes on under another name.
+#: How the continuation of an alarm under another name is marked.
 STILL = "the alarm of {} still stands"
 
-#: Shares of hypotheses below this are not listed.
+#: Posterior shares below this are not listed.
 LEAST_SHARE = 0.01
 
-#: What heads the inputs that were beyond the range that thresholds were learned from.
+#: Heading of the column with inputs outside the range from which thresholds were learned.
 BEYOND_HEADING = "beyond learned range"
 
-#: How a run begins to say that nothing alarmed.
+#: Begin of the sentence that there was no alarm.
 NO_ALARM = "No alarm"
 
 #: Why a row cannot alarm, by its status.
@@ -71,7 +69,7 @@ REASONS = {
     NO_DECISION: "the window of the monitor was not full, or a warm-up or a gap was not over",
 }
 
-#: At which evidence an alarm without a name was named: whether beside another, and how much.
+#: Evidence at which an alarm was named, before it has a name: whether beside an earlier change, and how large.
 NOT_NAMED = (False, -math.inf)
 
 #: Alarms that a summary lists.
@@ -80,16 +78,18 @@ MOST_LISTED_ALARMS = 20
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """An alarm: rows above a threshold that are less than 20 rows apart, rows that are missing among them; where
-    sensors and faults are ranked, it ends where another change begins to be named.
+    """An alarm: rows above a threshold that are less than 20 rows apart.
+
+    Missing rows between them belong to it.  Where causes are ranked, an alarm ends at the row in which a later change
+    is first named.
 
     Parameters
     ----------
     by : str
         The column, or the kind of the monitor, whose threshold is passed.
     fault : str
-        The fault that it points to, at the largest evidence at which one is named, or where later rows tell it from
-        those that were as likely there, or decide within the first 20 of an alarm; empty where there is none.
+        The fault that it points to; empty where there is none.  It is the one named at the largest evidence, unless
+        later rows distinguish it from others that were as likely there, or rows among the first 20 decide.
     start, end : float, seconds
         Times of the first and the last row above the threshold.
     first_row, last_row : int
@@ -97,26 +97,26 @@ class AlarmEvent:
     rows : int
         Rows above the threshold.
     size, low, high : float
-        Estimate of the fault at its largest evidence, and its interval there: 95 % of the stated noise, or guaranteed
-        by an adaptive threshold; NaN where it is not known.
+        Estimate of the fault at the largest evidence, and its interval: with 95 % probability for the stated noise, or
+        guaranteed by an adaptive threshold; NaN where not known.
     evidence : float
-        Largest share of the threshold that was reached.
+        Largest ratio of the statistic to its threshold.
     distinguished : bool
         Whether the evidence distinguishes the faults; no fault is named otherwise.
     shares : tuple of (str, float)
-        What the alarm may be by posterior shares, the likeliest first: faults of the plant, ``sensor NAME``, and
-        ``none of these faults``; empty where these are not ranked.
+        Possible causes and their posterior shares, the likeliest first: faults of the plant, ``sensor NAME``, and
+        ``none of these faults``; empty where causes are not ranked.
     ties : tuple of str
-        Which of these are as likely as the one that is named.
+        Causes that are as likely as the one that is named.
     drifts : bool
-        Whether what is named drifts rather than jumped.
+        Whether the cause is a drift rather than a jump.
     shelved : float, seconds
-        Since when there has been an offset that no fault explains, where it has stood for 200 rows; else NaN.
+        Since when an offset has lasted that no fault explains, if for 200 rows or more; else NaN.
     beyond : tuple of str
-        Known inputs that were beyond the range that thresholds were learned from, in it or within 200 rows before.
+        Known inputs that left the range from which thresholds were learned, during the alarm or 200 rows before it.
     while_standing : str
-        What the alarm was called at first, where this one is its continuation under another name: it goes on without
-        a pause, and what came later is named since then.  Else empty.
+        The earlier name of an alarm that goes on without a pause under another name, which is that of a later change;
+        else empty.
 
     Examples
     --------
@@ -152,18 +152,17 @@ class AlarmEvent:
 
     @property
     def clear(self) -> bool:
-        """Whether a fault is named alone, and its interval, where one is known, excludes zero: else another fault may
-        be meant."""
+        """Whether one fault alone is named, and its interval, if known, excludes zero."""
         return bool(self.fault) and not self.ties and self.fault != NONE_OF_THESE and not self.low < 0.0 < self.high
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """What the alarm may be, all as likely, where hypotheses were ranked."""
+        """All causes that are as likely as the one that is named; empty where causes are not ranked."""
         return tuple(name for name, _ in self.shares[: len(self.ties) + 1])
 
     @property
     def valid(self) -> bool:
-        """Whether the interval is known and rests on nothing that the alarm itself contradicts."""
+        """Whether the interval is known, and the alarm does not contradict its assumptions."""
         return not math.isnan(self.low) and self.by not in CONTRADICTING
 
     def as_dict(self) -> dict[str, Any]:
@@ -174,19 +173,19 @@ class AlarmEvent:
 
 
 class AlarmLog:
-    """Gathers alarms row by row; ``columns`` are those of the output that hold estimates and intervals."""
+    """Collects alarms row by row; ``columns``: those of the output with estimates and intervals."""
 
     def __init__(self, columns: Sequence[str]) -> None:
         self._places = {name: i for i, name in enumerate(columns)}
         self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
-        self._named_by = dict[str, tuple[bool, float]]()  # at which evidence the fault of an open event was named
-        self._earlier = dict[str, int]()  # how many changes that were named came before an open event
-        self._place, self._places_of = 0, dict[str, int]()  # of this row, and of the last row of an open event
-        self._unexplained = dict[str, tuple[int, float]]()  # place and time since when no fault explains an open event
+        self._named_by = dict[str, tuple[bool, float]]()  # evidence at which the fault of an open event was named
+        self._earlier = dict[str, int]()  # number of named changes before an open event
+        self._place, self._places_of = 0, dict[str, int]()  # number of this row, and of the last row of each open event
+        self._unexplained = dict[str, tuple[int, float]]()  # first row and time without a cause
         self.silent = Counter[str]()
 
     def advance(self, missing: int) -> None:
-        """Go on to the next row, before which some are missing."""
+        """Advance to the next row, past ``missing`` rows."""
         self._place += missing + 1
 
     def take(
@@ -202,9 +201,11 @@ class AlarmLog:
         ranking: Ranking | None = None,
         beyond: tuple[str, ...] = (),
     ) -> None:
-        """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
-        fault would be named if there was one; ``ranking``: what it may be; ``beyond``: inputs that are
-        beyond what was learned."""
+        """Take a row above a threshold.
+
+        ``cells``: the numbers of its output; ``distinguished``: whether the evidence distinguishes faults; ``ranking``:
+        the possible causes; ``beyond``: inputs outside the range from which thresholds were learned.
+        """
         before = self._open.get(by)
         earlier = 0 if ranking is None else ranking.earlier
         is_another = before is not None and earlier > self._earlier[by]
@@ -222,16 +223,16 @@ class AlarmLog:
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
         size_before = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault
-        # The statistic is that of all changes together: what came later is named where it is itself the largest.
+        # The statistic includes all changes: a later change has a name of its own where it is the largest of them.
         is_later = ranking is not None and not math.isnan(ranking.ratio)
         naming = (is_later, ranking.ratio if ranking is not None and is_later else evidence)
         tells = before is None or (distinguished and earlier == self._earlier[by] and not naming <= self._named_by[by])
         shelved = self._shelved(by, fault, time)
-        # What explains an alarm that was shelved is reported, whatever it was called at larger evidence.
+        # A cause that explains a shelved alarm is reported, even if the alarm had another name at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
-        # What was as likely as another is named once later rows tell them apart, also at less evidence; and while
-        # begins are looked for, more rows say more of what began than one in which the statistic was larger.
+        # Causes that were equally likely are told apart by later rows even where the statistic is smaller; and among
+        # the first rows, several rows say more about the cause than the one with the largest statistic.
         is_better = _is_narrower(before, ranking) or (not is_later and _is_better_founded(before, ranking))
         is_alike = earlier == self._earlier[by] and is_later >= self._named_by[by][0]
         if distinguished and is_alike and is_better:
@@ -261,13 +262,13 @@ class AlarmLog:
 
     @staticmethod
     def _ranked(before: AlarmEvent | None, ranking: Ranking | None, *, tells: bool) -> dict[str, Any]:
-        """Return what an alarm may be, as ranked at the evidence at which it is named."""
+        """Return the fields of an event that hold the ranking at which it is named."""
         if tells:
             return {} if ranking is None else {"shares": ranking.shares, "ties": ranking.ties, "drifts": ranking.drifts}
         return {} if before is None else {"shares": before.shares, "ties": before.ties, "drifts": before.drifts}
 
     def _shelved(self, by: str, fault: str, time: float) -> float:
-        """Return since when an open alarm has been unexplained, where that is long enough; else NaN."""
+        """Return since when no fault has explained an open alarm, if for long enough; else NaN."""
         if fault != NONE_OF_THESE:
             self._unexplained.pop(by, None)
             return math.nan
@@ -275,7 +276,7 @@ class AlarmLog:
         return since if self._place - place >= SHELVED_AFTER else math.nan
 
     def shelved_since(self, by: str) -> float:
-        """Return since when an alarm by a monitor has been shelved; NaN where it is not."""
+        """Return since when the alarm of a monitor has been shelved; NaN if it is not."""
         return self._open[by].shelved if by in self._open else math.nan
 
     def _size(self, fault: str, cells: Sequence[float], ranking: Ranking | None = None) -> tuple[float, float, float]:
@@ -293,19 +294,19 @@ class AlarmLog:
         return size, low, high
 
     def events(self) -> tuple[AlarmEvent, ...]:
-        """Return all alarms, those that are not over too, by their start."""
+        """Return all alarms, including open ones, ordered by their start."""
         return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
 
 
 def _is_narrower(before: AlarmEvent | None, ranking: Ranking | None) -> bool:
-    """Whether a later row leaves fewer of those that an open alarm may be, and nothing else."""
+    """Whether a later row leaves fewer of the equally likely causes of an open alarm, and no other."""
     if before is None or ranking is None or not before.ties:
         return False
     return {ranking.named, *ranking.ties} < set(before.candidates)
 
 
 def _is_better_founded(before: AlarmEvent | None, ranking: Ranking | None) -> bool:
-    """Whether a later row of those in which the begin of an open alarm is looked for decides for one hypothesis."""
+    """Whether a later row, still among the first of an open alarm, decides for a single cause."""
     if before is None or ranking is None or not before.shares or before.rows >= LOOKED_FOR:
         return False
     return not ranking.ties and ranking.named != NONE_OF_THESE
@@ -314,8 +315,10 @@ def _is_better_founded(before: AlarmEvent | None, ranking: Ranking | None) -> bo
 def alarm_rows(
     events: Sequence[AlarmEvent], date_of: Callable[[float], str], units: Mapping[str, str] | None = None
 ) -> tuple[list[tuple[str, ...]], int]:
-    """Return a table of alarms, heading first and without empty columns, and how many more there are; ``units``: of
-    faults and outputs, by name."""
+    """Return a table of alarms, headings first and without empty columns, and how many alarms it leaves out.
+
+    ``units``: of faults and outputs, by name.
+    """
     if not events:
         return [], 0
 
@@ -336,14 +339,13 @@ def alarm_rows(
 
 
 def fault_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
-    """Return what an alarm is said to be: with all that is as likely, whether it drifts, since when it is shelved, and
-    whether it is the alarm before under another name."""
+    """Return the description of an alarm: its cause, ties, drift, since when it is shelved, and its earlier name."""
     text = _named_text(event, date_of)
     return f"{text}; {STILL.format(event.while_standing)}" if text and event.while_standing else text
 
 
 def _named_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
-    """Return what an alarm is said to be by itself."""
+    """Return the description of an alarm without its earlier name."""
     if not math.isnan(event.shelved):
         return f"{event.fault} ({SHELVED.format(date_of(event.shelved))})"
     if not event.distinguished:
@@ -366,7 +368,7 @@ def rows_in_alarm(events: Sequence[AlarmEvent]) -> dict[str, int]:
 
 
 def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
-    """Return what share of so many ``rows`` was in alarm: an alarm that stands for hours is one event."""
+    """Return sentences on the share of ``rows`` in alarm, since a single alarm may last for hours."""
     sentences = []
     for by, count in rows_in_alarm(events).items():
         own = [event for event in events if event.by == by]
@@ -378,14 +380,14 @@ def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
 
 
 def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
-    """Return what a reader of the table has to know about its intervals, and about names of long alarms."""
+    """Return the notes below a table of alarms: on its intervals, and on the names of long alarms."""
     notes = [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []
     is_long = any(event.shares and event.last_row - event.first_row >= SHELVED_AFTER for event in events)
     return [*notes, NAMED_BY_THE_FIRST] if is_long else notes
 
 
 def silence(run: Any, by: str) -> list[str]:
-    """Return what a run without alarms says, and how many rows were without a decision; ``by`` names what watched."""
+    """Return the sentences on a run without alarms and on rows without a decision; ``by``: what would have alarmed."""
     silent, sentences = sum(run.silent.values()), list[str]()
     if not run.alarms and silent < run.rows:
         where = f" in the {run.rows - silent} rows that could alarm" if silent else ""

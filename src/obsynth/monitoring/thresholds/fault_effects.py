@@ -1,13 +1,14 @@
-"""Effects of faults and of sensors' offsets on whitened residuals, and what each explains of the latest rows.
+"""Effects of faults and of sensors' offsets on the whitened residuals, and how well each explains the latest rows.
 
-An extended Kalman filter of states and parameters follows what changes. For a change that begins at row k0, the error d
-of its estimates and the effect g on the innovations obey, with the filter's own steps and gains,
+For a change that begins at row k0, the error d of the estimates of an extended Kalman filter and the effect g on its
+innovations obey, with the filter's own steps and gains,
 
 .. math::
     d^-_k = A_k d_{k-1}, \\qquad g_k = H_k d^-_k + s_k, \\qquad d_k = d^-_k - K_k g_k
 
-where a fault that jumps begins with ``d = e_j`` and a sensor's offset is s (Willsky & Jones 1976). The residuals are
-whitened by what was learned of them, and their effects likewise. Linear observers have one response for every begin.
+where a jump of fault j begins with ``d = e_j``, and s is the offset of a sensor (Willsky & Jones 1976).  The learned
+whitening model is applied to the residuals and to these effects alike.  The response of a linear observer is the same
+for every k0.
 """
 
 from __future__ import annotations
@@ -35,46 +36,48 @@ from obsynth.observers.nonlinear.estimates import DAERow
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
 
-#: A begin is followed for so many rows, twice as many for each factor of two in its row, and at most for the last
-#: number: all of the latest rows, and ever fewer of those before.
+#: For how many rows the effect of a change that begins at a row is computed: the first number, doubled for each factor
+#: of two in the row's number, at most the last number.  So every recent row is a candidate, and older ones are sparse.
 FOLLOWED, MOST_DOUBLINGS = 8, 5
 
-#: Begins that are followed at once, without those of an alarm: four for each factor of two, and some more.
+#: Number of candidate begins at any time, without those of an alarm: four for each factor of two, and a few more.
 BEGINS = 4 * (MOST_DOUBLINGS + 1) + 12
 
-#: The likeliest begins of so many hypotheses are followed as long as an alarm lasts.
+#: Number of hypotheses whose likeliest begins are kept for as long as an alarm lasts.
 HELD = 12
 
-#: Rows after a begin that count: what is further away says more of the model than of the change.
+#: Rows after a begin that count: later ones depend more on errors of the model than on the change.
 COUNTED = FOLLOWED * 2**MOST_DOUBLINGS
 
-#: Numbers that are followed in each row at most, a hundredth of a second: of larger designs nothing is ranked.
+#: Most numbers that are updated in each row, which takes a hundredth of a second; larger designs have no ranking.
 MOST_NUMBERS = 2_000_000
 
 
 class EffectState(NamedTuple):
-    """The state of `FaultEffects`: of each begin that is followed (``b`` of them)."""
+    """The state of `FaultEffects`, for ``b`` candidate begins."""
 
     begun: (
-        FloatArray  # begun, until: ``(b,)``: its row, NaN where there is none, and the one up to which it is followed
+        FloatArray  # begun, until: ``(b,)``: row of each begin, NaN for none, and the row up to which it is a candidate
     )
     until: FloatArray
-    error: FloatArray  # ``(b, n, h)``: what each hypothesis does to the error of the estimates
-    past: FloatArray  # ``(b, order, m, h)``: to the residuals of the rows before, latest first
+    error: FloatArray  # ``(b, n, h)``: effect of each hypothesis on the error of the estimates
+    past: FloatArray  # ``(b, order, m, h)``: effect on the residuals of earlier rows, latest first
     score: FloatArray  # score, information: ``(b, h)``
     information: FloatArray
-    sums: FloatArray  # ``(b, m)``: of white rows
-    counts: FloatArray  # ``(b,)``: how many these are
-    held: FloatArray  # ``(b,)``: one for begins of an alarm, which are followed as long as it lasts
+    sums: FloatArray  # ``(b, m)``: of whitened rows
+    counts: FloatArray  # ``(b,)``: number of these rows
+    held: FloatArray  # ``(b,)``: one for begins that are kept while an alarm lasts
     row: float = 0.0  # of the last sample
-    alarmed: float = 0.0  # alarmed, quiet: rows of an alarm, and rows since the last one of it
+    alarmed: float = 0.0  # alarmed, quiet: rows in alarm, and rows since the last of them
     quiet: float = 0.0
-    earlier: EarlierChanges = EarlierChanges()  # changes that were named, and are subtracted from what came later
+    earlier: EarlierChanges = EarlierChanges()  # named changes, whose effects are subtracted from later rows
 
 
 class Seen(NamedTuple):
-    """What a row is predicted from and judged by, ``(m,)`` each: residuals and estimates that are there, and those of
-    them that count, as the others follow from the rows before."""
+    """Which residuals and estimates of a row are present, and which of these are tested, ``(m,)`` each.
+
+    Those that are present but not tested follow from earlier rows.
+    """
 
     there: NDArray[np.bool_]
     judged: NDArray[np.bool_]
@@ -82,14 +85,14 @@ class Seen(NamedTuple):
 
 _NOTHING = read_only(np.zeros(0))
 
-#: The state where effects are not followed.
+#: The state of a rule without a ranking.
 NO_EFFECTS = EffectState(
     _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING
 )  # fmt: skip
 
 
 class FaultEffects(ABC):
-    """Effects of hypotheses on whitened residuals, row by row, and what they explain."""
+    """Effects of hypotheses on the whitened residuals, row by row, and the ranking that follows from them."""
 
     def __init__(self, faults: Sequence[str], outputs: Sequence[str], learned: LearnedThresholds) -> None:
         self.hypotheses: tuple[Hypothesis, ...] = hypotheses_of(faults, outputs)
@@ -98,11 +101,11 @@ class FaultEffects(ABC):
     @property
     @abstractmethod
     def sizes(self) -> tuple[int, int]:
-        """How many errors are followed, and how many rows of residuals of the past."""
+        """Order of the error system, and number of earlier rows of residuals."""
 
     @property
     def numbers(self) -> int:
-        """How many numbers are followed in each row."""
+        """How many numbers are updated in each row."""
         per_hypothesis = self.model.channels + self.sizes[0] + self.sizes[1] * self.model.channels
         return (BEGINS + HELD) * len(self.hypotheses) * per_hypothesis
 
@@ -118,9 +121,11 @@ class FaultEffects(ABC):
     def step(
         self, state: EffectState, observation: Any, white: FloatArray, seen: Seen | None, share: float
     ) -> EffectState:
-        """Return the state after a sample with the observer's ``observation``: its residuals are ``white (m,)``,
-        of which those that were ``seen`` are measured, or none (`None`). Where these are cut to a ``share``, so are
-        the effects on them."""
+        """Return the state after a sample.
+
+        ``observation``: what the observer says of it; ``white (m,)``: its whitened residuals; ``seen``: which of them
+        are measured, `None` for none; ``share``: the factor by which they were limited, which applies to effects too.
+        """
         if isinstance(observation, DAERow) and observation.k == 0:
             return self.init()
         state = self._with_begin(self._ended(state) if state.quiet == HOLD else state)
@@ -149,15 +154,17 @@ class FaultEffects(ABC):
     def _moved(
         self, state: EffectState, observation: Any, rows: FloatArray, seen: Seen | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``error`` and ``past`` after a sample, which is one of so many ``rows (b,)`` from each begin, and the
-        effects on its white residuals ``(b, m, h)``."""
+        """Return ``error`` and ``past`` after a sample, and the effects on its whitened residuals ``(b, m, h)``.
+
+        ``rows (b,)``: number of rows since each begin.
+        """
 
     @abstractmethod
     def _at_begin(self, error: FloatArray) -> None:
-        """Write the errors ``(n, h)`` with which hypotheses begin."""
+        """Write the errors ``(n, h)`` at the begin of each hypothesis."""
 
     def _ended(self, state: EffectState) -> EffectState:
-        """Return the state after an alarm that was too short for what it was named by to be kept: it is now."""
+        """Return the state after the end of a short alarm: the change that it was named by now counts as earlier."""
         earlier = state.earlier
         if not earlier.number and state.alarmed > 0.0:
             _, ranking, best = self._beside_none(state._replace(alarmed=float(LOOKED_FOR)))
@@ -168,7 +175,7 @@ class FaultEffects(ABC):
         return state
 
     def _with_begin(self, state: EffectState) -> EffectState:
-        """Return the state with one more begin, in the place of one that is followed no longer."""
+        """Return the state with a new candidate begin in the place of one that has expired."""
         row, quiet = state.row + 1.0, state.quiet + 1.0
         begun = np.where((row < state.until) | (state.held > 0.0), state.begun, np.nan)
         place, until = int(np.isnan(begun).argmax()), state.until.copy()
@@ -180,7 +187,7 @@ class FaultEffects(ABC):
         if quiet > HOLD:
             held[:] = 0.0
             earlier = earlier._replace(looked=0, is_over=1)
-            # What began before they were named is followed no longer.
+            # Begins before the named changes are no longer candidates.
             if row - earlier.since > COUNTED:
                 earlier = earlier._replace(changes=0, number=0)
             held[earlier.begins] = 1.0
@@ -192,8 +199,10 @@ class FaultEffects(ABC):
         )  # fmt: skip
 
     def explained(self, state: EffectState) -> tuple[EffectState, Ranking | None]:
-        """Return what the rows up to one in alarm may be, and the state that keeps the begins of the likeliest: what
-        came last, where it is more than the changes that were named before."""
+        """Return the ranking of the rows up to one in alarm, and the state that keeps the likeliest begins.
+
+        Where there is a change later than those already named, it is the one that is ranked.
+        """
         state, ranking, best = self._beside_none(state)
         if state.earlier.number:
             return self._beside_earlier(state, ranking)
@@ -202,7 +211,7 @@ class FaultEffects(ABC):
         return state, ranking
 
     def _beside_none(self, state: EffectState) -> tuple[EffectState, Ranking | None, NDArray[np.intp]]:
-        """Return what rows in alarm may be if there is one change alone, and where that began ``(h,)``."""
+        """Return the state, the ranking under the assumption of a single change, and its begins ``(h,)``."""
         parts, is_held = (state.score, state.information, state.sums, state.counts), state.held > 0.0
         if state.alarmed >= LOOKED_FOR and is_held.any():
             explanation, best = _explanation(*(part[is_held] for part in parts))
@@ -216,9 +225,10 @@ class FaultEffects(ABC):
         return state, ranked(self.hypotheses, explanation), best
 
     def _beside_earlier(self, state: EffectState, alone: Ranking | None) -> tuple[EffectState, Ranking | None]:
-        """Return what came after the changes that were named, where it is something else; else what it is ``alone``."""
+        """Return the state and the ranking of a change after the named ones; ``alone`` where there is no other
+        cause."""
         earlier, later = state.earlier, state.begun > state.earlier.since
-        # A new alarm is one of its own, whatever it is called.
+        # A new alarm is separate from earlier ones even if its cause has the same name.
         alone = alone._replace(earlier=earlier.number) if alone is not None and earlier.is_over else alone
         if not later.any():
             return state, alone
@@ -231,7 +241,7 @@ class FaultEffects(ABC):
         ranking = ranking._replace(earlier=earlier.number, ratio=ratio)
         state = state._replace(earlier=earlier._replace(looked=earlier.looked + 1))
         best = np.flatnonzero(later)[best]
-        # Begins of what is looked for now are followed, in place of those that an alarm is not named by.
+        # Begins for the new search replace kept ones of hypotheses that no alarm is named by.
         held = np.zeros_like(state.held)
         held[earlier.begins] = 1.0
         held[best[np.argsort(-explanation.ratios)[: HELD - earlier.changes]]] = 1.0
@@ -241,8 +251,8 @@ class FaultEffects(ABC):
         return state, ranking
 
     def _keeping(self, state: EffectState, ranking: Ranking | None, best: NDArray[np.intp]) -> EffectState:
-        """Return the state in which the effect of what an alarm is named by, which began at ``best (h,)``, is
-        subtracted from what comes later."""
+        """Return the state in which the effect of the named change, with the begins ``best (h,)``, is subtracted from
+        later rows."""
         if ranking is None:
             return state
         earlier = state.earlier.kept(state.row)
@@ -272,7 +282,7 @@ class FilterEffects(FaultEffects):
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """How many errors are followed, and how many rows of residuals of the past."""
+        """Order of the error system, and number of earlier rows of residuals."""
         return self._shapes[0] + self._shapes[1], self.model.order
 
     def _at_begin(self, error: FloatArray) -> None:
@@ -305,7 +315,7 @@ class FilterEffects(FaultEffects):
 
 
 class LinearEffects(FaultEffects):
-    """Effects on a linear observer: one response, whatever the row in which they begin."""
+    """Effects on a linear observer, whose response does not depend on the row in which a change begins."""
 
     def __init__(self, design: ObserverDesign, learned: LearnedThresholds) -> None:
         self._errors, self._learned = error_model(design), learned
@@ -313,7 +323,7 @@ class LinearEffects(FaultEffects):
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """How many errors are followed, and how many rows of residuals of the past: none."""
+        """Order of the error system, and number of earlier rows of residuals, which is zero."""
         return 0, 0
 
     def _at_begin(self, error: FloatArray) -> None:
@@ -323,13 +333,13 @@ class LinearEffects(FaultEffects):
         self, state: EffectState, observation: Any, rows: FloatArray, seen: Seen | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         places = np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)
-        # Later on a jump has settled, and a drift goes on as it went.
+        # After the computed rows the response to a jump is constant, and that to a drift is linear.
         slope = self.responses[-1] - self.responses[-2]
         return state.error, state.past, self.responses[places] + np.maximum(rows - COUNTED, 0.0)[:, None, None] * slope
 
     @cached_property
     def responses(self) -> FloatArray:
-        """What each hypothesis does to white rows from its begin on, ``(rows, m, h)``."""
+        """Responses of the whitened rows to each hypothesis from its begin on, ``(rows, m, h)``."""
         errors, states = self._errors, len(self._errors.observer.state_names)
         observer = errors.observer
         places = [observer.row_names.index(name) for name in self._learned.columns]
@@ -353,7 +363,7 @@ class LinearEffects(FaultEffects):
 
 
 def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffects | None:
-    """Return how faults and sensors of a design act on what its thresholds watch; `None` where that is not known."""
+    """Return the effects of a design's faults and sensors on the watched columns; `None` where they are not known."""
     observer = design.observer
     effects: FaultEffects | None = None
     if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
@@ -382,8 +392,11 @@ def _gain(observation: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray
 def _whitened(
     model: Autoregression, past: FloatArray, row: FloatArray, seen: Seen | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return effects on the latest residuals ``(b, order, m, h)``, and on the white ones of this row ``(b, m, h)``.
-    What was not seen is as the rest makes it most likely; without any, as it is predicted, and nothing is added."""
+    """Return the effects on the latest residuals ``(b, order, m, h)`` and on the whitened row ``(b, m, h)``.
+
+    Missing residuals have their conditional mean given the others; without any others, their prediction, and the row
+    adds no evidence.
+    """
     predicted = np.einsum("jac,bjch->bah", model.A, past) if model.order else np.zeros_like(row)
     judged = predicted if seen is None else _completed(model, predicted, row, seen.judged)
     kept = judged if seen is None else np.where(seen.there[:, None], row, judged)
@@ -392,7 +405,7 @@ def _whitened(
 
 
 def _completed(model: Autoregression, predicted: FloatArray, row: FloatArray, judged: NDArray[np.bool_]) -> FloatArray:
-    """Return effects on a row ``(b, m, h)``, of which what is not ``judged (m,)`` is as the rest makes it likely."""
+    """Return the effects on a row ``(b, m, h)``; entries that are not ``judged (m,)`` have their conditional mean."""
     if judged.all():
         return row
     precision = model.whitener.T @ model.whitener
@@ -403,7 +416,7 @@ def _completed(model: Autoregression, predicted: FloatArray, row: FloatArray, ju
 
 
 def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[FloatArray, FloatArray]:
-    """Return transition and input matrix of one row; of a continuous observer over the time between rows."""
+    """Return the transition and input matrices between two rows, for a continuous observer over their interval."""
     if dt > 0.0:
         return a, b
     n = len(a)
@@ -416,8 +429,11 @@ def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[Floa
 def _explanation(
     score: FloatArray, information: FloatArray, sums: FloatArray, counts: FloatArray
 ) -> tuple[Explanation, NDArray[np.intp]]:
-    """Return what hypotheses explain at their likeliest begin, and its place ``(h,)``: from scores and information
-    ``(b, h)`` of each, and sums ``(b, m)`` of so many white rows ``(b,)``."""
+    """Return the explanation of each hypothesis at its likeliest begin, and the place of that begin ``(h,)``.
+
+    ``score`` and ``information (b, h)``: of each begin and hypothesis; ``sums (b, m)``: of whitened rows, ``counts``
+    of them.
+    """
     is_informed = information > 0.0
     safe = np.where(is_informed, information, 1.0)
     ratios = np.where(is_informed, score**2 / safe, 0.0)
