@@ -145,9 +145,28 @@ def scheduled_c_texts(
 
 def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarms: Alarms, seconds: float) -> str:
     _, observer = design.scheduled
+    lines = [
+        comment(f"sha256 of the gain set: {digest}"),
+        f'#include "{included(header)}"',
+        "",
+        "#include <math.h>",
+        "",
+        *_constants(observer, alarms, seconds),
+        "",
+        *(line for name, table in _tables(observer, seconds).items() for line in table_lines(name, table)),
+        *table_lines("levels", filled_table(np.array([list(alarms.levels.values())]))),
+        "",
+        alarms.source(prefix),
+        _step(observer, prefix),
+    ]
+    return "\n".join(lines)
+
+
+def _constants(observer: ScheduledObserver, alarms: Alarms, seconds: float) -> list[str]:
+    """Return the lines that define sizes and constants."""
     is_continuous = observer.dt == 0.0
     recovering = math.ceil(observer.forgetting / seconds - SETTLING_SLACK) if is_continuous else observer.forgetting
-    held, nu = observer.scheduling, observer.inputs
+    held = observer.scheduling
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     sizes = {
         "Z_COUNT": observer.order,
@@ -162,7 +181,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
     }
     # These stand in conditions of the preprocessor too.
     defined = {
-        "U_COUNT": nu,
+        "U_COUNT": observer.inputs,
         "FAULT_COUNT": nf,
         "DIVIDES": int(not observer.effectiveness_is_one),
         "CORRECTS": int(observer.correction is not None),
@@ -172,26 +191,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         "WATCHED": len(alarms.levels),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }
-    groups = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
-    copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in groups if n)
-    taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN) if nu else ""
-    values = "\n        ".join(f"a[{i}] = {_c_text(text, held.names)};" for i, text in enumerate(held.expressions))
-    body = filled_template(
-        "scheduled_step.c",
-        prefix,
-        {
-            "STEP_ARGUMENTS": ", ".join(_arguments(observer, prefix)).replace("*state", "*s", 1),
-            "COPY_U": taken,
-            "COPY_ROWS": copied,
-            "FUNCTION_VALUES": values,
-        },
-    )
-    lines = [
-        comment(f"sha256 of the gain set: {digest}"),
-        f'#include "{included(header)}"',
-        "",
-        "#include <math.h>",
-        "",
+    return [
         "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
         *(f"#define {name} {size}" for name, size in defined.items()),
         f"#define FORGETTING ((REAL){float(observer.forgetting)!r})",
@@ -201,14 +201,27 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str, alarm
         f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
         f"#define MOST_ROWS {MOST_ROWS!r}",
         "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
-        "",
-        *(line for name, table in _tables(observer, seconds).items() for line in table_lines(name, table)),
-        *table_lines("levels", filled_table(np.array([list(alarms.levels.values())]))),
-        "",
-        alarms.source(prefix),
-        body,
     ]
-    return "\n".join(lines)
+
+
+def _step(observer: ScheduledObserver, prefix: str) -> str:
+    """Return the functions that start the observer and take a row."""
+    held = observer.scheduling
+    nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
+    groups = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
+    copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in groups if n)
+    taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN)
+    values = "\n        ".join(f"a[{i}] = {_c_text(text, held.names)};" for i, text in enumerate(held.expressions))
+    return filled_template(
+        "scheduled_step.c",
+        prefix,
+        {
+            "STEP_ARGUMENTS": ", ".join(_arguments(observer, prefix)).replace("*state", "*s", 1),
+            "COPY_U": taken if observer.inputs else "",
+            "COPY_ROWS": copied,
+            "FUNCTION_VALUES": values,
+        },
+    )
 
 
 def _tables(observer: ScheduledObserver, seconds: float) -> dict[str, FloatArray]:

@@ -327,24 +327,7 @@ def _realised_with_lag(
         if single and many:
             return None, IDENTITIES_LEFT[-1]
     shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
-    # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
-    sizes = [nz * na, nz * count, rows * len(left_kernel), rows * count]
-
-    def equations(*parts: Any) -> Any:
-        height = next(len(part) for part in parts if part is not None)
-        return np.hstack(
-            [np.zeros((height, size)) if part is None else part for size, part in zip(sizes, parts, strict=True)]
-        )
-
-    states, outputs = np.eye(nz), np.eye(rows)
-    system = np.vstack(
-        [
-            equations(np.kron(a, e.T) - np.kron(states, own.T), np.kron(states, shadow.T), None, None),
-            equations(np.kron(states, bd.T), None, None, None),
-            equations(np.kron(c, e.T), None, -np.kron(outputs, (left_kernel @ own).T), np.kron(outputs, shadow.T)),
-            equations(None, None, np.kron(outputs, (left_kernel @ bd).T), None),
-        ]
-    )
+    system, sizes = _identities(a, c, (e, own, bd), shadow, left_kernel)
     products = ((-b, dd_past), (b, plant.Dd), (-d, dd_past), (d, plant.Dd))
     wanted = np.concatenate([(one @ other).ravel() for one, other in products])
     terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
@@ -363,23 +346,70 @@ def _realised_with_lag(
             strict=True,
         )
     )
-    # Only the copies that are read.
-    basis = reachable_basis(moved.T, np.vstack([into, c_past]).T) if count else np.zeros((0, 0))
+    return _with_copies(plant, filter_, (copied, moved), (into, c_past), (t, s @ left_kernel, lag)), share
+
+
+def _identities(
+    a: FloatArray,
+    c: FloatArray,
+    past: tuple[FloatArray, FloatArray, FloatArray],
+    shadow: FloatArray,
+    left_kernel: FloatArray,
+) -> tuple[FloatArray, list[int]]:
+    """Return the equations of T, of the copies in the state, of S with ``T0 = S left_kernel`` and of the copies in the
+    rows, as one matrix on all entries, and the number of entries of each.
+
+    ``past``: E, A and Bd of the plant with its last samples; ``shadow``: the copied modes as rows on its states.
+    """
+    (e, own, bd), nz, rows, count = past, len(a), len(c), len(shadow)
+    sizes = [nz * len(e), nz * count, rows * len(left_kernel), rows * count]
+
+    def equations(*parts: Any) -> Any:
+        height = next(len(part) for part in parts if part is not None)
+        return np.hstack(
+            [np.zeros((height, size)) if part is None else part for size, part in zip(sizes, parts, strict=True)]
+        )
+
+    states, outputs = np.eye(nz), np.eye(rows)
+    system = np.vstack(
+        [
+            equations(np.kron(a, e.T) - np.kron(states, own.T), np.kron(states, shadow.T), None, None),
+            equations(np.kron(states, bd.T), None, None, None),
+            equations(np.kron(c, e.T), None, -np.kron(outputs, (left_kernel @ own).T), np.kron(outputs, shadow.T)),
+            equations(None, None, np.kron(outputs, (left_kernel @ bd).T), None),
+        ]
+    )
+    return system, sizes
+
+
+def _with_copies(
+    plant: DescriptorSystem,
+    filter_: Model,
+    modes: tuple[FloatArray, FloatArray],
+    read: tuple[FloatArray, FloatArray],
+    tracking: tuple[FloatArray, FloatArray, int],
+) -> RealisedFilter:
+    """Return a filter beside those copies of modes that it reads.
+
+    ``modes``: rows that copy them, and their matrix; ``read``: how state and rows read them; ``tracking``: T, T0, lag.
+    """
+    (a, b, c, d), (copied, moved), (into, c_past), (t, t0, lag) = filter_, modes, read, tracking
+    basis = reachable_basis(moved.T, np.vstack([into, c_past]).T) if len(copied) else np.zeros((0, 0))
     basis, driven_count = _driven_first(basis, moved, copied @ (plant.B / _sizes_of_columns(plant.B)))
     into, c_past, moved = into @ basis, c_past @ basis, basis.T @ moved @ basis
     moved[driven_count:, :driven_count] = 0.0
-    copies, copy_count = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
-    follower = RealisedFilter(
-        np.block([[a, into], [np.zeros((copy_count, nz)), moved]]),
+    copy_count = basis.shape[1]
+    copies = np.hstack([basis.T @ copied, np.zeros((copy_count, t.shape[1] - plant.nx))])
+    return RealisedFilter(
+        np.block([[a, into], [np.zeros((copy_count, len(a))), moved]]),
         np.vstack([b, np.zeros((copy_count, plant.ny))]),
         np.hstack([c, c_past]),
         d,
         np.vstack([t, copies]),
-        s @ left_kernel,
+        t0,
         lag,
         copy_count - driven_count,
     )
-    return follower, share
 
 
 def modes_that_inputs_drive(plant: DescriptorSystem) -> int:

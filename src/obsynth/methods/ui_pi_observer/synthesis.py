@@ -133,16 +133,9 @@ def synthesise(
     require_all_conditions(known.conditions)
     working = known.plant
     progress("decoupling the unknown inputs")
-    paper_matrices = method.given_decoupling()
-    as_they_are = paper_matrices is not None or isinstance(weights.get("measurement"), Mapping)
-    merged = None if as_they_are else merged_outputs(working)
-    tried: tuple[PlacementProblem, Choice] | None = None
-    if method.decay is None and region is None and not as_they_are:
-        merged, tried = _without_likeness(known, model, method, merged, weights)
+    merged, tried = _chosen_outputs(known, model, method, region, weights)
     designed = working if merged is None else merged.plant
-    if method.leaves_freedom_to_us and not as_they_are:
-        merged, tried = _with_quietest_outputs(known, model, method, merged, tried)
-        designed = working if merged is None else merged.plant
+    paper_matrices = method.given_decoupling()
     problem = (
         tried[0]
         if tried
@@ -180,6 +173,25 @@ def synthesise(
         (*notes(known, problem, method, synthesis.certificate.claims), *more),
         known.transformation,
     )
+
+
+def _chosen_outputs(
+    known: Existence, model: Exosystem, method: UiPiObserver, region: NamedRegion | None, weights: Mapping[str, Any]
+) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
+    """Return the outputs to design with, ``None`` for those of the plant, and the gains where these are chosen by then.
+
+    Outputs that show the same are merged, and those that add noise are left out, unless the options name matrices or
+    the noise of single outputs.
+    """
+    if method.given_decoupling() is not None or isinstance(weights.get("measurement"), Mapping):
+        return None, None
+    merged = merged_outputs(known.plant)
+    tried: tuple[PlacementProblem, Choice] | None = None
+    if method.decay is None and region is None:
+        merged, tried = _without_likeness(known, model, method, merged, weights)
+    if method.leaves_freedom_to_us:
+        merged, tried = _with_quietest_outputs(known, model, method, merged, tried)
+    return merged, tried
 
 
 def _slower(

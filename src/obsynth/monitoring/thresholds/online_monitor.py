@@ -214,12 +214,21 @@ def online_monitor(
     _require_linear_kind(kind, nominal)
     if is_guaranteed(design):
         return data_monitor(design, kind, options)
-    design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
+    return _of_linear_design(
+        design, kind, {**options, "window": window, "false_alarms": false_alarms, "change": change}
+    )
+
+
+def _of_linear_design(design: ObserverDesign, kind: str, options: Mapping[str, Any]) -> Monitor:
+    """Return the monitor of a linear design, for tolerances where the plant or the options have any."""
+    scenario, noise_bound, initial_error = options["scenario"], options["noise_bound"], options["initial_error"]
+    disturbance = options["disturbance"] or "any"
+    design, adaptive = tolerances_of(design, options["constants"], options["initial_set"], initial_error)
     watched = watched_by(design, kind)
-    model, dt = _endless_model(design, scenario, window, sample_time, watched=watched)
+    model, dt = _endless_model(design, scenario, options["window"], options["sample_time"], watched=watched)
     model = model.held() if disturbance == "held" else model
     require_noise(noise_bound, noisy=model.noisy)
-    bounds = _known_bounds(design, model, disturbance_bounds, scenario)
+    bounds = _known_bounds(design, model, options["disturbance_bounds"], scenario)
     noisy = noisy_design(design, scenario)
     limited = kind in ("pointwise", "window")
 
@@ -234,11 +243,15 @@ def online_monitor(
             watched=watched,
         )
 
+    numbers = {"window": options["window"], "false_alarms": options["false_alarms"], "change": options["change"]}
     rule: Rule
     if limited or kind == "paper":
         start = 0.0 if initial_error is None else float(initial_error)
-        norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, watched)
+        norm, limit = _norm_rule(
+            design, kind, model, bounds, noise_bound, start, options["gamma"], options["window"], dt, watched
+        )
         if adaptive:
+            initial_set = options["initial_set"]
             rule, promise = over_box(
                 noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt, disturbance=disturbance
             )
@@ -249,20 +262,10 @@ def online_monitor(
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
         ending = _ending(kind, model, norm, limit, gaps, dt, from_the_first=initial_error is not None)
     else:
-        rule = _whitened(
-            kind,
-            model,
-            bounds if scenario is None else None,
-            watched,
-            window=window,
-            change=change,
-            false_alarms=false_alarms,
-            dt=dt,
-        )
+        rule = _whitened(kind, model, bounds if scenario is None else None, watched, **numbers, dt=dt)
         ending = ANY_LENGTH + (_JITTERING if model.continuous is not None else "")
-    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
-    return made(statement_of(kind, model, assumed, watched=watched, **numbers) + ending + NO_TOLERANCE, rule)
+    return made(statement_of(kind, model, assumed, watched=watched, **numbers, dt=dt) + ending + NO_TOLERANCE, rule)
 
 
 def _over_region(design: ObserverDesign, options: Mapping[str, Any]) -> Monitor:
