@@ -140,16 +140,25 @@ def certified(
         The search found no certificate.  That is no proof that none exists.
     """
     extreme = ExtremeVertices.of(errors, gains) if lyapunov == "common" and steps is None else None
-    search = _Search(
-        errors,
-        extreme,
-        ErrorUnits.of(errors if extreme is None else extreme.errors),
-        {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain, "free_output": free_output},
-        gains,
-        solver,
-        settings,
-        [],
-    )
+    whole = errors if extreme is None else extreme.errors
+    options = {"goal": goal, "lyapunov": lyapunov, "steps": steps, "gain": gain, "free_output": free_output}
+    search = _Search(errors, extreme, ErrorUnits.of(whole), options, gains, solver, settings, [])
+    try:
+        return _found(search, level, margin, decay, fast_decay=fast_decay)
+    except SolverError as error:
+        ended = None if error.record is None else error.record["status"]
+        if level is not None or ended == "infeasible" or not whole.constant_output:
+            raise
+    # A solver may end without numbers in one set of coordinates and with them in another.
+    search = replace(search, units=ErrorUnits.of(whole, combined=False))
+    return _found(search, level, margin, decay, fast_decay=fast_decay)
+
+
+def _found(
+    search: _Search, level: float | None, margin: float, decay: float | None, *, fast_decay: bool
+) -> VertexCertificate:
+    """Return the certificate that a search finds at the required level, or near the least one; see `certified`."""
+    errors, solver, settings = search.errors, search.solver, search.settings
     least, z_unit, size = _least(search.units, search.options_with(decay), search.given, solver, settings, search.runs)
     levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS + WIDE_ROOMS]
     if level is None and least < NEGLIGIBLE[0] * size:
@@ -522,8 +531,9 @@ class ErrorUnits:
     out_of_outputs: FloatArray  # its inverse
 
     @classmethod
-    def of(cls, errors: ErrorPolytope) -> ErrorUnits:
-        """Return units that suit all vertices."""
+    def of(cls, errors: ErrorPolytope, *, combined: bool = True) -> ErrorUnits:
+        """Return units that suit all vertices; ``combined``: measurements that say nearly the same are combined to ones
+        that say different things."""
         n, m = errors.order, errors.outputs
         if errors.ball or (errors.differential is not None and errors.differential < n):
             # A remainder is a norm in the given units; algebraic equations have rows of their own.
@@ -536,8 +546,7 @@ class ErrorUnits:
         # All states in a unit in which the inputs are near one: P is then as large as the level, whatever that is.
         driven = float(np.linalg.norm(b / states[:, None]))
         states = states * float(np.exp2(np.round(np.log2(driven)))) if driven > 0.0 else states
-        if errors.constant_output and m:
-            # Measurements that say nearly the same are combined to ones that say different things.
+        if combined and errors.constant_output and m:
             directions, sizes, _ = np.linalg.svd(np.hstack([errors.C[0] * states, errors.D[0]]), full_matrices=True)
             sizes = np.concatenate([sizes, np.zeros(m - len(sizes))])
             sizes = np.where(sizes > 0.0, sizes, 1.0)
