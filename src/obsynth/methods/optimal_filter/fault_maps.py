@@ -87,7 +87,8 @@ class Options(Protocol):
 class FaultMap(NamedTuple):
     """What the estimate is of the faults: a delay of each, or a reference model; exact or not; what is weighted.
 
-    ``undriven``: so many last columns of the plant's noise carry none: they only keep the states that they reach.
+    ``undriven``: number of last columns of the plant's noise whose intensity is zero: they keep the states that they
+    reach in the problem.
     """
 
     delays: tuple[int, ...] | None

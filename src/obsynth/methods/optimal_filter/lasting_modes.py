@@ -1,10 +1,10 @@
-"""Undamped modes without noise: integrators of a constant, and oscillations.
+"""Lasting modes: modes of the plant that do not decay and that no noise drives, as constants and oscillations.
 
-Their part of the error decays only where the filter reads them, which costs noise: where they are on the boundary of
-stability, no stable filter reaches the least gain of all causal ones, and some come as near as one likes.  Beyond it
-(modes that grow) a gap may stay.  The filter is designed as if a little noise drove them, and its claims are those for
-the plant as it is.  The least mean square of filters whose errors decay needs no such noise where modes grow: the
-Riccati equation has a stabilising solution without it.
+The error of such a mode decays only if the filter corrects the mode by measurements, which adds noise to the estimates.
+For modes on the boundary of stability, no stable filter reaches the least gain of all causal filters, but stable
+filters come arbitrarily near to it.  For growing modes a gap may remain.  The filter is designed with a little noise on
+these modes, and its claims are computed for the plant without that noise.  For growing modes, the least mean square of
+filters whose errors decay needs no added noise: the Riccati equation has a stabilising solution without it.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import unused_names
 
-#: Noise that drives them, of the largest of the plant's own, in units in which the plant is near one: the less, the
-#: nearer is the gain to the least, and the slower the errors settle (at 1e-2 in some hundred samples).
+#: Noise added to lasting modes, relative to the largest noise of the plant, in units in which the plant's entries are
+#: near one.  Less noise gives a gain nearer to the least one, and slower errors (at 1e-2 some hundred samples).
 ADDED_DRIVES = (1e-2, 1e-3, 1e-4, 1e-5)
-#: How far from the axis, of its distance from the origin or of the fastest mode, a continuous mode counts as lasting.
+#: A continuous mode counts as lasting up to this distance left of the axis, relative to the size of the fastest mode.
 AXIS_SHARE = 1e-6
 
 
 def with_lasting_modes_driven(plant: DescriptorSystem, drive: float = ADDED_DRIVES[0]) -> DescriptorSystem:
-    """Return the plant with noise that drives its lasting modes; as it is where each of them is driven."""
+    """Return the plant with noise that drives its lasting modes; the plant itself if noise drives each of them."""
     return _with_drives(plant, drive, "drive of lasting mode", grows=None)
 
 
 def with_growing_modes_reached(plant: DescriptorSystem, drive: float | None = None) -> tuple[DescriptorSystem, int]:
-    """Return the plant with columns of noise, the last ones, that reach its undriven growing modes, and their count.
+    """Return the plant with additional last columns of noise on growing modes without noise, and their number.
 
-    ``drive``: of noise on lasting modes that do not grow; by default none.
+    ``drive`` is the size of the noise on lasting modes that do not grow; by default there is none.
     """
     driven = plant if drive is None else _with_drives(plant, drive, "drive of lasting mode", grows=False)
     reached = _with_drives(driven, ADDED_DRIVES[0], "start of growing mode", grows=True)
@@ -71,9 +71,11 @@ def _with_drives(plant: DescriptorSystem, drive: float, name: str, *, grows: boo
 
 
 def _undriven(e: FloatArray, a: FloatArray, noise: FloatArray, discrete: bool, grows: bool | None) -> FloatArray:
-    """Return orthonormal columns that drive every lasting mode which the noise does not: of all, or as it ``grows``.
+    """Return orthonormal columns of noise for the lasting modes that no noise drives.
 
-    Columns of modes that grow drive none of the others that last, nor do those of these drive modes that grow."""
+    ``grows`` selects the growing modes, those that do not grow, or all (`None`).  Columns of growing modes drive no
+    other lasting mode, and columns of the others no growing mode.
+    """
     alpha, beta = scipy.linalg.eigvals(a, e, homogeneous_eigvals=True)
     finite = _is_finite(alpha, beta)
     edge = 1.0 - STABLE_RADIUS

@@ -1,4 +1,4 @@
-"""Delayed outputs: a sampled plant with late outputs, and how much later the inputs are that a filter shows."""
+"""Delayed outputs: a sampled plant with delayed outputs, and how many samples a filter looks ahead in the inputs."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from obsynth.numerics.standard_form import standard_form
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 
-#: What a filter shows of later inputs, as a share of what cancels in it, without being rounding.
+#: A response to later inputs is more than rounding above this share of the terms that cancel in it.
 LATER_SHARE = 1e-6
 
 
 def later_inputs(plant: DescriptorSystem, filter_: Model) -> int:
-    """Return by how many samples inputs to the plant's equations are later than the estimates of a filter they reach.
+    """Return by how many samples the estimates of a filter precede the latest inputs g that they depend on.
 
-    ``E x+ = A x + g``: outputs of index 2 or more depend on g of later samples, with coefficients that a filter may
-    cancel, or not.
+    In ``E x+ = A x + g``, outputs of a plant of index 2 or more depend on later samples of g.  A filter may cancel
+    these terms.
     """
     units = PlantUnits.of(plant).rounded()
     equations, outputs = units.equations[:, None], units.outputs[:, None]
@@ -36,7 +36,7 @@ def later_inputs(plant: DescriptorSystem, filter_: Model) -> int:
 
 
 def with_late_outputs(plant: DescriptorSystem, samples: int) -> DescriptorSystem:
-    """Return a sampled plant whose outputs are those of some samples before, as states at the end."""
+    """Return a sampled plant whose outputs are delayed by some samples; the delayed ones are additional last states."""
     ny, count = plant.ny, plant.ny * samples
     late = np.zeros((count, plant.nx))
     late[:ny] = plant.C

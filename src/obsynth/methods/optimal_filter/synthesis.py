@@ -58,13 +58,15 @@ from obsynth.verification.inequalities import stability_factor
 from obsynth.verification.seen_outputs import seen_plant
 from obsynth.verification.signals_from_rest import has_index_one
 
-#: A delay is taken when its least gain is at most this much above that of the longest one that was tried.
+#: A delay is taken if its least gain is at most this factor times the smallest one of the tried delays.
 DELAY_ROOM = 1.05
-#: Delays that are tried after the first one that exists, and at most where each is better than that by `DELAY_ROOM`.
+#: Number of delays that are tried after the shortest possible one, and their largest number if each of them lowers the
+#: gain by more than `DELAY_ROOM`.
 MORE_DELAYS, MOST_MORE_DELAYS = 4, 8
-#: Gain and least gain that differ by no more than this share are together.
+#: Relative difference up to which the gain counts as equal to the least gain.
 CLOSED_GAP = 3e-5
-#: Noise of the sensors that is tried to bring them together, of the outputs' sizes; with more states it takes too long.
+#: Sensor noises, relative to the sizes of the outputs, that are tried to close the gap between both; and the largest
+#: number of states for which this does not take too long.
 OFFERED_NOISES, MOST_STATES_OF_OFFERS = (1e-4, 1e-3, 1e-2), 16
 LASTING_NOTE = (
     "A mode of the plant does not decay, and no noise drives it: a filter of least gain may ignore it, and its "
@@ -88,9 +90,9 @@ AT_ONCE_NOTE = (
     "Outputs of this plant show inputs of later samples (its index is 2 or more), and this filter reads each output at "
     "once: its errors are a state only {} later, of which the proofs are."
 )
-#: A filter forgets modes that last as fast as its deviation is at most this much above the least one.
+#: The errors of lasting modes decay as fast as the deviation stays below this factor times the least one.
 FORGETTING_ROOM = 1.01
-#: Significant digits of a bound in words.
+#: Significant digits of a bound in a text.
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
 
@@ -110,7 +112,7 @@ def synthesise(plant: DescriptorSystem, options: OptimalFilterMethod, *, progres
         try:
             made = _with_late_outputs(plant, options)
         except SolverError:
-            # Read late or not, an undriven mode that grows is in the errors of a filter of this plant.
+            # The errors contain an undriven growing mode, whether or not outputs are delayed.
             if not lasts:
                 raise
             made = None
@@ -123,10 +125,10 @@ def synthesise(plant: DescriptorSystem, options: OptimalFilterMethod, *, progres
 
 
 def _with_late_outputs(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis | None:
-    """Return the filter of least gain that reads no output before the inputs which it shows have acted.
+    """Return the filter of least gain for delayed outputs; ``None`` for other plants, or if there is no such filter.
 
-    Outputs of index 2 or more show inputs of later samples, of which the errors of no stored realisation are a state:
-    that of a filter which takes the outputs as many samples later is.  ``None`` for another plant, or without one.
+    Outputs of a plant of index 2 or more depend on inputs of later samples, so that the errors of a stored realisation
+    have no state equation.  They have one if each output is delayed until these inputs have acted.
     """
     if not plant.is_discrete or has_index_one(plant):
         return None
@@ -149,18 +151,19 @@ def _with_late_outputs(plant: DescriptorSystem, options: OptimalFilterMethod) ->
     return replace(made, notes=(*made.notes, LATE_NOTE.format(counted(late, "sample"))))
 
 
-def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Synthesis:
-    """Return the filter of least mean square whose errors decay whatever the start of modes that no noise drives.
+def _with_every_start(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis:
+    """Return the filter of least mean square whose errors decay from any initial state of modes that no noise drives.
 
-    Modes that neither decay nor grow have the most noise, of some, that costs little: it sets how fast they are forgot.
+    Modes that neither decay nor grow get the largest of some noises with which the deviation is little above the least
+    one.  This noise determines how fast the errors of these modes decay.
     """
     lasts = with_growing_modes_reached(plant, ADDED_DRIVES[0])[0].nw > with_growing_modes_reached(plant)[0].nw
     for drive in ADDED_DRIVES if lasts else (None,):
         driven, undriven = with_growing_modes_reached(plant, drive)
-        curve, chosen = _chosen(driven, asked, undriven=undriven)
-        own_map = on_plant(plant, chosen.fault_map, asked.weights)
-        least = least_deviation_of_every_start(plant, own_map, asked.weights)
-        made = _made(plant, asked, curve, chosen, searched=driven, least=least if lasts else None)
+        curve, chosen = _chosen(driven, options, undriven=undriven)
+        own_map = on_plant(plant, chosen.fault_map, options.weights)
+        least = least_deviation_of_every_start(plant, own_map, options.weights)
+        made = _made(plant, options, curve, chosen, searched=driven, least=least if lasts else None)
         if made.certificate.claims["deviation"] <= FORGETTING_ROOM * least:
             break
     notes = [*made.notes[:-1]]
@@ -181,8 +184,8 @@ def _with_every_start(plant: DescriptorSystem, asked: OptimalFilterMethod) -> Sy
 
 
 def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -> Synthesis:
-    """Return the filter for the largest noise on modes that last of which less does not lower the gain."""
-    found: list[tuple[Synthesis, FaultMap]] = []
+    """Return the filter for the largest noise on lasting modes below which less noise does not lower the gain."""
+    candidates: list[tuple[Synthesis, FaultMap]] = []
     least_gain = math.inf
     for drive in ADDED_DRIVES:
         driven = with_lasting_modes_driven(plant, drive)
@@ -190,24 +193,24 @@ def _with_lasting_modes(plant: DescriptorSystem, options: OptimalFilterMethod) -
             curve, chosen = _chosen(driven, options)
             made = _made(plant, options, curve, chosen, searched=driven)
         except (PreconditionError, SolverError):
-            # With less noise rounding may spoil the proof; the filter for more of it is proved already.
-            if not found:
+            # With less noise the proof may fail by rounding; the filter for more noise is already proved.
+            if not candidates:
                 raise
             break
         gain, least = made.certificate.claims["gain"], made.certificate.claims.get("least", 0.0)
-        if found and gain >= least_gain * (1.0 - CLOSED_GAP):
+        if candidates and gain >= least_gain * (1.0 - CLOSED_GAP):
             break
-        found.append((made, chosen.fault_map))
+        candidates.append((made, chosen.fault_map))
         least_gain = gain
         if chosen.is_nothing or gain - least <= CLOSED_GAP * gain:
             return made
-    return _with_least_of_every_start(plant, options, *found[-1])
+    return _with_least_of_every_start(plant, options, *candidates[-1])
 
 
 def _with_least_of_every_start(
     plant: DescriptorSystem, options: OptimalFilterMethod, made: Synthesis, fault_map: FaultMap
 ) -> Synthesis:
-    """Return a design whose note has the least gain of filters whose errors decay, where one was found."""
+    """Return a design whose note states the least gain of filters whose errors decay, if it could be computed."""
     try:
         least = least_gain_of_every_start(plant, fault_map, options.weights)
     except (PreconditionError, SolverError):
@@ -218,7 +221,7 @@ def _with_least_of_every_start(
 def synthesis_of_gains(
     plant: DescriptorSystem, options: OptimalFilterMethod, fault_map: FaultMap, gains: Mapping[str, FloatArray]
 ) -> Synthesis:
-    """Return the filter of gains ``K`` and ``Z0`` on the innovation, beside the bounds on every filter."""
+    """Return the filter with gains ``K`` and ``Z0`` of the innovation, with the bounds on the gains of all filters."""
     plant = seen_plant(plant, options.decoupled_names(plant))
     least = designed(plant, fault_map, options.norm)
     white = whitened(least.problem)
@@ -238,9 +241,10 @@ def _made(
     searched: DescriptorSystem | None = None,
     least: float | None = None,
 ) -> Synthesis:
-    """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled.
+    """Return the realisation and the certificate of a filter.
 
-    ``searched``: the plant that the filter was searched for, where noise was added; ``least``: the least deviation.
+    ``plant`` has the disturbances that are not decoupled.  ``searched`` is the plant with added noise for which the
+    filter was designed, if there is one; ``least`` is the least deviation.
     """
     fault_map = chosen.fault_map
     own = plant if searched is None else searched
@@ -276,7 +280,7 @@ def _made(
     solver = {
         "engine": "filtering Riccati equation",
         "added_noise": chosen.added_noise,
-        "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
+        "trade_off": [[row.filter.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
     gains = {"T": follower.T, "T0": follower.T0}
     dependent = [plant.output_names[int(place)] for place in matrices.get("dependent", np.zeros(0)).ravel()]
@@ -295,7 +299,7 @@ def _made(
 def _recomputed_gain(
     plant: DescriptorSystem, chosen: Designed, follower: RealisedFilter, observer: LinearObserver, norm: str
 ) -> float:
-    """Return the norm of a filter on a plant, which need not be the one that it was searched for."""
+    """Return the norm of a filter on a plant, which may differ from the one that the filter was designed for."""
     channel = ErrorChannel.of(error_model_of(plant, observer, follower), chosen.fault_map)
     if norm == "h2":
         return channel.deviation(plant.dt)
@@ -309,9 +313,10 @@ _Realised: TypeAlias = tuple[Designed, RealisedFilter, LinearObserver]
 
 
 def _of_low_order(plant: DescriptorSystem, chosen: Designed, limit: int, full: int, norm: str) -> _Realised:
-    """Return the filter of low order with the least gain of its own, of those whose realisation keeps the fault map.
+    """Return the filter of at most ``limit`` states with the least gain among those whose realisation keeps the fault
+    map.
 
-    They come in the order of their norms at some angles, between which a gain may have its peak.
+    The candidates are ordered by their norms at some frequencies; the peak of a gain may be between these.
     """
     filters = free_filters(plant, chosen, limit, norm)
     best = _best_of(plant, filters, limit, norm)
@@ -333,7 +338,7 @@ def _of_low_order(plant: DescriptorSystem, chosen: Designed, limit: int, full: i
 def _best_of(
     plant: DescriptorSystem, filters: Sequence[Designed], limit: int, norm: str, best: _Realised | None = None
 ) -> _Realised | None:
-    """Return the filter of least gain of its own, of some and one that is known, that has a realisation."""
+    """Return the filter of least gain among some and a known one (``best``) that can be realised."""
     for filter_ in filters:
         realised = _of_at_most(plant, filter_, limit, norm)
         gain = math.inf if realised is None else _recomputed_gain(plant, filter_, *realised, norm)
@@ -345,7 +350,7 @@ def _best_of(
 def _of_at_most(
     plant: DescriptorSystem, chosen: Designed, limit: int, norm: str
 ) -> tuple[RealisedFilter, LinearObserver] | None:
-    """Return a filter's realisation; ``None`` where it has more states, or no longer the fault map."""
+    """Return a filter's realisation; ``None`` if it has more than ``limit`` states or does not keep the fault map."""
     try:
         follower, observer, missed = realisation_of(plant, chosen, norm)
     except SolverError:
@@ -365,9 +370,9 @@ def _reduced_note(chosen: Designed, order: int, full: int, claims: Mapping[str, 
 def _with_enough_noise(
     plant: DescriptorSystem, chosen: Designed, norm: str
 ) -> tuple[Designed, RealisedFilter, LinearObserver]:
-    """Return a filter and its realisation, for the least added noise with which this keeps its digits.
+    """Return a filter and its realisation, for the least added noise with which the realisation is accurate enough.
 
-    The poles of a filter without noise run to infinity: the nearer they are to it, the fewer digits are left.
+    The poles of a filter tend to infinity as noise vanishes, and large poles cost significant digits.
     """
     may_have_more = chosen.least is None or (norm == "h2" and not plant.is_discrete)
     more = [noise for noise in ADDED_NOISES if noise > chosen.added_noise and may_have_more]
@@ -375,14 +380,14 @@ def _with_enough_noise(
     while True:
         try:
             follower, observer, missed = realisation_of(plant, chosen, norm)
-            # Noise that carries none, beside undriven modes, would count in the mean square of this plant.
+            # Columns of zero intensity, which reach undriven modes, would count in the mean square of this plant.
             if norm == "h2" and not plant.is_discrete and not chosen.fault_map.undriven:
                 missed = max(missed, _lost_share(plant, chosen, follower, observer))
             if best is None or missed < best[0]:
                 best = missed, (chosen, follower, observer)
         except SolverError:
             if not more and best is None:
-                # Where outputs show nothing of the faults, what a filter reads of them is rounding.
+                # If the outputs do not depend on the faults, the gains of a filter are rounding errors.
                 zero = without_filter(plant, chosen, norm)
                 if zero is None:
                     raise
@@ -392,7 +397,7 @@ def _with_enough_noise(
         try:
             chosen = designed(plant, chosen.fault_map, norm, more)
         except PreconditionError as error:
-            # A filter exists: its equations have a solution for less noise.  Verification judges its digits.
+            # A filter exists, since its equations have a solution for less noise.  Verification checks its accuracy.
             if best is not None:
                 return best[1]
             raise SolverError(
@@ -404,7 +409,7 @@ def _with_enough_noise(
 
 
 def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: RealisedFilter, observer: LinearObserver) -> float:
-    """Return by which share the mean square of the stored numbers, its root, is another one than that of the design."""
+    """Return the relative difference between the root mean square of the stored realisation and that of the design."""
     own = _recomputed_gain(plant, chosen, follower, observer, "h2")
     if chosen.is_nothing:
         return 0.0 if np.isfinite(own) else math.inf
@@ -412,21 +417,21 @@ def _lost_share(plant: DescriptorSystem, chosen: Designed, follower: RealisedFil
 
 
 class _Row(NamedTuple):
-    """A delay that was looked at: the filter of the norm that counts, and the least of both norms."""
+    """A delay that was tried: its filter for the chosen norm, and the least value of both norms."""
 
-    found: Designed
+    filter: Designed
     gain: float
     deviation: float
 
     @property
-    def counts(self) -> float:
-        return 0.0 if self.found.is_nothing else self.found.gain
+    def chosen_norm(self) -> float:
+        return 0.0 if self.filter.is_nothing else self.filter.gain
 
 
 def _chosen(plant: DescriptorSystem, options: OptimalFilterMethod, *, undriven: int = 0) -> tuple[list[_Row], Designed]:
-    """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none.
+    """Return the delays that were tried, and the filter with the chosen one; a reference model has no delay.
 
-    ``undriven``: last columns of the noise that carry none.
+    ``undriven`` is the number of last columns of noise whose intensity is zero: they only reach undriven modes.
     """
     fault_map, _ = first_problem(plant, options)
     fault_map = fault_map._replace(undriven=undriven)
@@ -435,12 +440,12 @@ def _chosen(plant: DescriptorSystem, options: OptimalFilterMethod, *, undriven: 
         return [], first
     curve = [_row(plant, first, options.norm)]
     is_open = tuple(late is None for late in delays_of(options.delay, plant))
-    # A delay that was asked for is printed with what one sample more would give.
+    # Beside a delay that the user chose, the gain with one more sample is reported.
     more, most = (MORE_DELAYS, MOST_MORE_DELAYS) if any(is_open) else (1, 1)
     which = is_open if any(is_open) else None
     for samples in range(1, 1 + most):
-        falling = len(curve) < 2 or DELAY_ROOM * curve[-1].counts < curve[-2].counts
-        if curve[-1].found.is_nothing or (len(curve) > more and not falling):
+        falling = len(curve) < 2 or DELAY_ROOM * curve[-1].chosen_norm < curve[-2].chosen_norm
+        if curve[-1].filter.is_nothing or (len(curve) > more and not falling):
             break
         try:
             curve.append(
@@ -450,8 +455,8 @@ def _chosen(plant: DescriptorSystem, options: OptimalFilterMethod, *, undriven: 
             break
     if not any(is_open):
         return curve, first
-    enough = max(DELAY_ROOM * min(row.counts for row in curve), first.nothing)
-    chosen = next(row.found for row in curve if row.found.gain <= enough)
+    enough = max(DELAY_ROOM * min(row.chosen_norm for row in curve), first.nothing)
+    chosen = next(row.filter for row in curve if row.filter.gain <= enough)
     if is_auto(options.delay):
         return curve, chosen
     return curve, _shortened(plant, chosen, is_open, enough, options.norm)
@@ -460,7 +465,8 @@ def _chosen(plant: DescriptorSystem, options: OptimalFilterMethod, *, undriven: 
 def _shortened(
     plant: DescriptorSystem, chosen: Designed, is_open: tuple[bool, ...], enough: float, norm: str
 ) -> Designed:
-    """Return the filter with each delay that is open as short as a gain that is enough allows, one after the other."""
+    """Return the filter with each delay that the user left open shortened in turn, as long as the gain is at most
+    ``enough``."""
     for i, may_be_shorter in enumerate(is_open):
         delays = chosen.fault_map.delays or ()
         for late in range(delays[i] if may_be_shorter else 0):
@@ -476,7 +482,7 @@ def _shortened(
 
 
 def _row(plant: DescriptorSystem, filter_: Designed, norm: str) -> _Row:
-    """Return the row of a filter, with the least of the norm that it is not for."""
+    """Return the row of a filter, with the least value of the other norm."""
     if filter_.is_nothing:
         return _Row(filter_, 0.0, 0.0)
     other = designed(plant, filter_.fault_map, "h2" if norm == "hinf" else "hinf")
@@ -522,7 +528,7 @@ def _statement(
     claims: Mapping[str, float],
     dependent: Sequence[str],
 ) -> str:
-    """Return what no filter beats, how near this one is to it, and what more delay would give."""
+    """Return a text on the least norm of all filters, the norm of this one, and the norms with longer delays."""
     fault_map = chosen.fault_map
     if not fault_map.exact:
         of = "over all causal filters, matching this reference model"
@@ -540,7 +546,7 @@ def _statement(
     elif chosen.is_nothing:
         text = f"Least gain from disturbances and noise together, {of}: 0; this filter: 0 but for rounding."
     else:
-        # What holds at any delay holds at this one.
+        # A bound for all delays is one for this delay.
         least = max(claims.get("least", 0.0), claims.get("non_causal_limit", 0.0))
         low, high = bracketed(least, claims["gain"])
         if dependent:
@@ -549,10 +555,10 @@ def _statement(
             of += f" is at most {upper_text(claims['answer_limit'], 3)}"
         of = f"from disturbances and noise together, {of}"
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
-    places = [row.found.fault_map.delays for row in curve]
+    places = [row.filter.fault_map.delays for row in curve]
     place = places.index(fault_map.delays) if fault_map.delays in places else len(curve)
     if place + 1 < len(curve):
-        text += f" With delay {_late(curve[place + 1])}: {curve[place + 1].counts:.5g}."
+        text += f" With delay {_late(curve[place + 1])}: {curve[place + 1].chosen_norm:.5g}."
     elif place > 0 and place + 1 == len(curve) and not chosen.is_nothing:
         text += " Longer delays were not tried, and each sample more still lowered it: give a delay to go on."
     if "non_causal_limit" in claims:
@@ -562,11 +568,11 @@ def _statement(
 
 
 def _late(row: _Row) -> str:
-    return in_words(row.found.fault_map.delays or ())
+    return in_words(row.filter.fault_map.delays or ())
 
 
 def _gap(plant: DescriptorSystem, chosen: Designed, options: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
-    """Return how far gain and least gain are apart, and which noise, that was tried, brings them together."""
+    """Return a text on the gap between the gain and the least gain, and on a sensor noise that closes it."""
     least, gain = claims.get("least", 0.0), claims.get("gain", 0.0)
     if options.norm == "h2" or chosen.is_nothing or chosen.least is not None:
         return "State the noise of every sensor (sensor_noise)."
@@ -585,7 +591,8 @@ def _gap(plant: DescriptorSystem, chosen: Designed, options: OptimalFilterMethod
 
 
 def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[str, float], str, str] | None:
-    """Return the least noise of the sensors without any, of some that are tried, with which the gap is closed."""
+    """Return the least of some noises on sensors without noise that closes the gap, with both bounds on the least
+    gain."""
     quiet = [i for i in range(plant.ny) if not plant.Dw[i].any()] or list(range(plant.ny))
     sizes = 1.0 / PlantUnits.of(plant).outputs
     few = plant.nx <= MOST_STATES_OF_OFFERS and chosen.fault_map.weights is None
@@ -610,7 +617,7 @@ def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[
 
 
 def bracketed(low: float, high: float) -> tuple[str, str]:
-    """Return both ends of an interval as texts, rounded outwards, in the digits that agree and two more."""
+    """Return both ends of an interval as texts, rounded outwards, with two digits more than agree."""
     gap = (high - low) / high if np.isfinite(high) and high > 0.0 else 1.0
     agreeing = -math.log10(gap) if gap > 0.0 else MOST_DIGITS
     digits = int(np.clip(agreeing + 2.0, FEWEST_DIGITS, MOST_DIGITS))

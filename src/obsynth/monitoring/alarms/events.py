@@ -226,19 +226,21 @@ class AlarmLog:
         # The statistic includes all changes: a later change has a name of its own where it is the largest of them.
         is_later = ranking is not None and not math.isnan(ranking.ratio)
         naming = (is_later, ranking.ratio if ranking is not None and is_later else evidence)
-        tells = before is None or (distinguished and earlier == self._earlier[by] and not naming <= self._named_by[by])
+        renames = before is None or (
+            distinguished and earlier == self._earlier[by] and not naming <= self._named_by[by]
+        )
         shelved = self._shelved(by, fault, time)
         # A cause that explains a shelved alarm is reported, even if the alarm had another name at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
-            tells = True
+            renames = True
         # Causes that were equally likely are told apart by later rows even where the statistic is smaller; and among
         # the first rows, several rows say more about the cause than the one with the largest statistic.
         is_better = _is_narrower(before, ranking) or (not is_later and _is_better_founded(before, ranking))
-        is_alike = earlier == self._earlier[by] and is_later >= self._named_by[by][0]
-        if distinguished and is_alike and is_better:
-            tells, naming = True, max(naming, self._named_by[by])
-        size, low, high = self._size(fault, cells, ranking) if tells else size_before
-        if tells:
+        is_same_change = earlier == self._earlier[by] and is_later >= self._named_by[by][0]
+        if distinguished and is_same_change and is_better:
+            renames, naming = True, max(naming, self._named_by[by])
+        size, low, high = self._size(fault, cells, ranking) if renames else size_before
+        if renames:
             named = fault
             self._named_by[by] = naming if distinguished else NOT_NAMED
         self._open[by] = AlarmEvent(
@@ -257,13 +259,13 @@ class AlarmLog:
             shelved=shelved,
             beyond=tuple(dict.fromkeys((*(() if before is None else before.beyond), *beyond))),
             while_standing=while_standing,
-            **self._ranked(before, ranking, tells=tells),
+            **self._ranked(before, ranking, renames=renames),
         )
 
     @staticmethod
-    def _ranked(before: AlarmEvent | None, ranking: Ranking | None, *, tells: bool) -> dict[str, Any]:
+    def _ranked(before: AlarmEvent | None, ranking: Ranking | None, *, renames: bool) -> dict[str, Any]:
         """Return the fields of an event that hold the ranking at which it is named."""
-        if tells:
+        if renames:
             return {} if ranking is None else {"shares": ranking.shares, "ties": ranking.ties, "drifts": ranking.drifts}
         return {} if before is None else {"shares": before.shares, "ties": before.ties, "drifts": before.drifts}
 
