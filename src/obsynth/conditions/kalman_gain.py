@@ -28,7 +28,7 @@ from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.problem import Conditions, Values, design_of, require_data
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arguments import arguments_checked, require_shape
-from obsynth.numerics.arrays import SMALLEST, FloatArray, as_matrix
+from obsynth.numerics.arrays import SMALLEST, FloatArray, matrix_or_multiple_of_identity
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
 from obsynth.observers.recursive.steady_filter import steady_state_filter
@@ -182,8 +182,7 @@ def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDesc
 
 
 def _covariance(covariance: Any, size: int, name: str) -> FloatArray:
-    matrix = as_matrix(covariance, name)
-    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(covariance) == 0 else matrix
+    matrix = matrix_or_multiple_of_identity(covariance, size, name)
     require_shape(matrix.shape, (size, size), name)
     return matrix
 

@@ -190,6 +190,12 @@ def as_matrix(value: Any, name: str) -> FloatArray:
     return read_only(matrix)
 
 
+def matrix_or_multiple_of_identity(value: Any, size: int, name: str) -> FloatArray:
+    """Return a matrix as `as_matrix` does; a number stands for so many times the identity ``(size, size)``."""
+    matrix = as_matrix(value, name)
+    return float(matrix[0, 0]) * np.eye(size) if np.ndim(value) == 0 else matrix
+
+
 def whole_numbers(values: Any, name: str, *, below: float = math.inf) -> NDArray[np.int64]:
     """Return stored counts, or positions below a limit; raise `SpecError` for negative numbers and fractions, which
     another reader might take in another way."""

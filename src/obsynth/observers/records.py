@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError, counted
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
-from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, matrix_or_multiple_of_identity
 from obsynth.numerics.suggestions import there_are
 from obsynth.plants.dae_signals import finite_vector
 from obsynth.plants.signal_names import index_of
@@ -135,8 +135,7 @@ def named_covariance(
         variances = np.zeros(len(names)) if others is None else others
         return np.diag(named_vector(value, names, variances, option))
     empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
-    matrix = np.zeros((0, 0)) if empty else as_matrix(value, option)
-    return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
+    return np.zeros((0, 0)) if empty else matrix_or_multiple_of_identity(value, len(names), option)
 
 
 def named_bounds(value: Any, names: Sequence[str], option: str) -> FloatArray:

@@ -139,7 +139,7 @@ def _directions(
 ) -> Directions | None:
     """Return the worst directions in double precision; ``None`` where points have one signal each, or none."""
     (bh, dh), (bw, dw) = hidden_and_bounded(plant, setting)
-    still, moved = _pencil(plant, np.hstack([bh, bw]), np.hstack([dh, dw]))
+    still, moved = invisible_pencil(plant, np.hstack([bh, bw]), np.hstack([dh, dw]))
     if still.shape[1] <= len(still):
         return None
     kernels = dict[complex, Kernel]()
@@ -160,8 +160,8 @@ def _directions(
     return worst_directions(kernels, (inputs, free), shown, through, discrete=plant.is_discrete)
 
 
-def _pencil(plant: DescriptorSystem, inputs: FloatArray, through: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pencil ``still + s moved`` whose kernel no output shows."""
+def invisible_pencil(plant: DescriptorSystem, inputs: FloatArray, through: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``[-A, -B; C, D]`` and ``[E, 0; 0, 0]``: the kernel of their pencil are motions without outputs."""
     still = np.block([[-plant.A, -inputs], [plant.C, through]])
     moved = np.zeros_like(still)
     moved[: plant.nx, : plant.nx] = plant.E
@@ -235,7 +235,7 @@ class _Trajectories:
 
     def _members(self, point: complex) -> list[_Member]:
         plant, nx = self.plant, self.plant.nx
-        still, moved = _pencil(plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
+        still, moved = invisible_pencil(plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
         free = still.shape[1] - len(still)
         if free < 0:
             return []
@@ -256,7 +256,7 @@ class _Trajectories:
 
     def _along(self, point: complex, free: ComplexArray) -> list[_Member]:
         """Return the signal of a point with these free entries, and its conjugate."""
-        still, moved = _pencil(self.plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
+        still, moved = invisible_pencil(self.plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
         pivots, others = pivots_of(still + point * moved)
         if point.imag:
             exact = complex_matrix(still + 0j) + complex_matrix(moved + 0j) * flint.acb(point)

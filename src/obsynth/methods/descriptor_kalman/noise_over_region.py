@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, dimensions_of
+from obsynth.numerics.arrays import FloatArray, dimensions_of, matrix_or_multiple_of_identity
 from obsynth.numerics.ranks import covariance_factor, product_but_rounding
 from obsynth.plants.polytopic import PolytopicSystem
 
@@ -83,8 +83,7 @@ def _constant(covariance: Any, size: int, name: str) -> FloatArray | None:
             "number.",
             path=name,
         )
-    matrix = as_matrix(covariance, name)
-    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(covariance) == 0 else matrix
+    matrix = matrix_or_multiple_of_identity(covariance, size, name)
     require_shape(matrix.shape, (size, size), name)
     covariance_factor(matrix, name)  # raises SpecError where the matrix is no covariance
     return matrix

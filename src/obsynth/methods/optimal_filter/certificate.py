@@ -24,7 +24,7 @@ from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.gain_by_pencil import prove_norm_by_eigenvalues
 from obsynth.verification.inequalities import prove_norm
 from obsynth.verification.invisible_at_infinity import proved_at_infinity
-from obsynth.verification.invisible_faults import proved_least, proved_limit
+from obsynth.verification.invisible_faults import invisible_pencil, proved_least, proved_limit
 from obsynth.verification.seen_outputs import Setting, nearly_dependent_outputs, with_independent_outputs, with_outputs
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
@@ -301,9 +301,7 @@ def _zeros_outside(plant: DescriptorSystem) -> list[complex]:
     inputs, through = np.hstack([plant.Bf, plant.Bd, plant.Bw]), np.hstack([plant.Df, plant.Dd, plant.Dw])
     if inputs.shape[1] != plant.ny:
         return []
-    still = np.block([[-plant.A, -inputs], [plant.C, through]])
-    moved = np.zeros_like(still)
-    moved[: plant.nx, : plant.nx] = plant.E
+    still, moved = invisible_pencil(plant, inputs, through)
     alpha, beta = scipy.linalg.eigvals(still, -moved, homogeneous_eigvals=True)
     unstable: list[complex] = []
     for top, bottom in zip(alpha, beta, strict=True):

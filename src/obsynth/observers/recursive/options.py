@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_number, real_vector, shown
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, matrix_or_multiple_of_identity
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation
 from obsynth.plants.sequences import MatrixSequence
@@ -94,7 +94,4 @@ def _vector(value: Any, size: int, name: str) -> FloatArray:
 
 
 def _square(value: Any, size: int, default: float, name: str) -> FloatArray:
-    if value is None:
-        return default * np.eye(size)
-    matrix = as_matrix(value, name)
-    return float(matrix[0, 0]) * np.eye(size) if np.ndim(value) == 0 else matrix
+    return default * np.eye(size) if value is None else matrix_or_multiple_of_identity(value, size, name)
