@@ -247,11 +247,11 @@ def rank_revealing_step(
     columns, sizes = Y.shape[1], np.abs(Y) if terms is None else terms
     if rounding is not None:
         Y = np.hstack([Y, rounding.root, np.eye(len(H))])
-    says = H.any(axis=1) | S.any(axis=1) | unknown.any(axis=1)
-    if not says.all():
+    has_terms = H.any(axis=1) | S.any(axis=1) | unknown.any(axis=1)
+    if not has_terms.all():
         # Remove equations 0 = 0: their rounding errors would count as equations with tiny noise.
-        _require_vanishing(Y[~says, mapped:columns], sizes[~says, mapped:], mapped)
-        H, S, Y, sizes, unknown = (part[says] for part in (H, S, Y, sizes, unknown))
+        _require_vanishing(Y[~has_terms, mapped:columns], sizes[~has_terms, mapped:], mapped)
+        H, S, Y, sizes, unknown = (part[has_terms] for part in (H, S, Y, sizes, unknown))
     S = _independent_noise(S)
     lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
     rank = len(head)
@@ -320,11 +320,18 @@ def _least_rounding(
 def _by_columns(
     H: FloatArray, unknown: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the lengths of the columns of ``[H -unknown]`` as powers of two, and of these columns at length one to
-    two: bases of their range and of what is beside it, the triangle ``(rank, rank)`` with the columns that it is of,
-    and the null space."""
+    """Return the rank-revealing QR factorisation of ``[H -unknown]`` with scaled columns.
+
+    Returns
+    -------
+    tuple
+        The lengths of the columns as powers of two, by which the columns are divided; orthonormal bases of the range of
+        the scaled matrix and of its complement; the triangle ``(rank, rank)`` and the columns that it belongs to; and a
+        basis of the null space.
+    """
     joined = np.hstack([H, -unknown])
-    # By other numbers each entry would be rounded: beside states of 1e11 more than what their sensors resolve.
+    # Division by powers of two is exact.  Other divisors would round each entry, which for states of 1e11 is more than
+    # the resolution of their sensors.
     lengths = power_of_two_below(np.sqrt(np.einsum("ij,ij->j", joined, joined)))
     q, r, order = _pivoted(joined / lengths)
     sizes = np.abs(np.diagonal(r))
@@ -338,8 +345,8 @@ def _by_columns(
 
 
 def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, _Factored, int]:
-    """Return the sizes ``(rows, 1)`` of the noise in parity, of that at size one `_largest_first`, and how many of its
-    rows hold noise."""
+    """Return the sizes ``(rows, 1)`` of the noise in the parity, the factorisation by `_largest_first` of that noise at
+    size one, and the number of its rows with noise."""
     sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
     sizes[sizes == 0.0] = 1.0
     factored = _largest_first((q2.T @ S / sizes[:, None]).T)
@@ -347,11 +354,12 @@ def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, _Factored, int]:
 
 
 def _largest_first(matrix: FloatArray) -> _Factored:
-    """Return the QR factorisation of ``matrix (rows, any)`` with pivoting, as LAPACK packs it, the order of columns,
-    the factors of the reflections, and the order of rows in which these are: the largest first.
+    """Return the QR factorisation of ``matrix (rows, any)`` with its rows ordered by decreasing size and with column
+    pivoting: as LAPACK packs it, with the order of columns, the factors of the reflections, and the order of rows.
 
-    In this order, with pivoting, each row is rounded beside itself (Cox and Higham 1998): rows that are sources of
-    noise may be far from each other."""
+    With both orders the rounding error of each row is small relative to that row (Cox and Higham 1998).  The rows are
+    sources of noise, whose sizes may differ by many decades.
+    """
     first = _largest_rows(matrix)
     if not matrix.size:
         return matrix, np.arange(matrix.shape[1]), np.zeros(0), first
@@ -365,7 +373,7 @@ def _largest_rows(matrix: FloatArray) -> NDArray[np.intp]:
 
 
 def _rotated(packed: FloatArray, tau: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Return ``Q' matrix`` by the reflections one after another: Q itself holds large rows only beside one."""
+    """Return ``Q' matrix`` by applying the reflections; a product with Q would lose the digits of small rows."""
     if not (tau.size and matrix.size):
         return matrix
     return np.asarray(lapack.dormqr("L", "T", packed[:, : len(tau)], tau, matrix, WORK * matrix.shape[1])[0])
@@ -381,7 +389,7 @@ def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.int
 
 
 def _formed(packed: FloatArray, tau: FloatArray) -> FloatArray:
-    """Return Q ``(rows, rows)`` of a factorisation as LAPACK packs it."""
+    """Return Q ``(rows, rows)`` of a packed factorisation of LAPACK."""
     rows, reflections = len(packed), len(tau)
     if not reflections:
         return np.eye(rows)
@@ -396,13 +404,13 @@ def _triangle(matrix: FloatArray) -> FloatArray:
 
 
 def _substituted(triangle: FloatArray, right: FloatArray, *, lower: bool = False) -> FloatArray:
-    """Return ``triangle^-1 right`` of a triangle without zeros on its diagonal, upper or ``lower``."""
+    """Return ``triangle^-1 right`` for a nonsingular triangular matrix, upper or ``lower``."""
     if not right.size:
         return np.zeros(right.shape)
     _finite(right)
     if triangle.flags.f_contiguous:
         return np.asarray(lapack.dtrtrs(_finite(triangle), right, lower=lower)[0])
-    # LAPACK reads rows as columns: the transposed triangle, transposed.
+    # LAPACK reads matrices by columns, and so sees the transposed triangle: solve with its transpose.
     return np.asarray(lapack.dtrtrs(_finite(triangle).T, right, lower=not lower, trans=1)[0])
 
 
@@ -438,8 +446,8 @@ def _whitened(
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
     # The rest of the parity is free of noise: it has to vanish, or the constraints contradict each other.
     remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
-    made_of = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
-    _require_vanishing(remainder[:, mapped : mapped + terms.shape[1]], made_of, mapped)
+    term_sizes = ((np.abs(q2.T) @ terms) / sizes)[order][rank:]
+    _require_vanishing(remainder[:, mapped : mapped + terms.shape[1]], term_sizes, mapped)
     rotated = _rotated(packed, tau, (S.T @ q1)[first]).T
     signs = np.sign(np.diagonal(lower))[:, None]
     return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:], remainder

@@ -3,17 +3,18 @@
 Source: Z. Wang, M. Rodrigues, D. Theilliol, Y. Shen, *Fault estimation filter design for discrete-time descriptor
 systems*, IET Control Theory and Applications 9 (10), 2015: filter (23), gain structure (60), LMI (45).
 
-Our deviations
-    1. (48) has the sign of its second term wrong: L = TA Psi Upsilon^+ + P^-1 Y (I - Upsilon Upsilon^+), see (60).
-    2. W = Upsilon^+ of (47), not Psi^+ as the proof says.
-    3. Existence is decided before any solver, with the zero condition the paper never states.
-    4. Only the part of Y that matters is a variable (Y = y V', V = null Upsilon'), or none at all (eliminated form).
-    5. gamma^2 is minimised directly; Algorithm 1 never advances past one step, our bisection ends with a bracket.
-    6. A second stage at a slightly larger gamma picks small gains: the bare optimum has condition numbers of 1e7.
-    7. Feedthrough of inputs, faults, disturbances and noise, exactly (see `prepared_plant`).
-    8. What is shipped corrects the state estimate, which the paper leaves biased by Psi.
-    9. Outputs may show disturbances alone: independent rows of [C Dd] do where the paper asks for rank C = ny, and the
-       filter takes such outputs for measured disturbances.
+Deviations from the paper
+    1. The sign of the second term of (48) is wrong: L = TA Psi Upsilon^+ + P^-1 Y (I - Upsilon Upsilon^+), see (60).
+    2. W = Upsilon^+ as in (47), not Psi^+ as in the proof.
+    3. Existence is decided before any solver runs, with a condition on zeros that the paper does not state.
+    4. Only the part of Y that has an effect is a variable (Y = y V', V = null Upsilon'), or Y is eliminated.
+    5. gamma^2 is minimised directly.  Algorithm 1 never advances past its first step; bisection ends with a bracket.
+    6. A second stage at a slightly larger gamma chooses small gains, since those of the optimum have condition numbers
+       of 1e7.
+    7. Feedthrough of inputs, faults, disturbances and noise is treated exactly (see `prepared_plant`).
+    8. The paper's state estimate has a bias of Psi times the fault; the shipped filter corrects it.
+    9. An output may depend on disturbances alone: it is enough that the rows of [C Dd] are independent, where the paper
+       assumes rank C = ny.  The filter treats such outputs as measured disturbances.
 """
 
 from __future__ import annotations
@@ -64,21 +65,21 @@ from obsynth.plants.transformations.redundant_outputs import (
 from obsynth.results.design import Certificate
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES, OUTPUTS_READ, least_gain_row
 
-#: Gains that take the outputs.
+#: Gains that multiply the outputs.
 _OF_OUTPUTS = ("N", "L", "W", "R")
 
-#: A free weight is taken by default where it lowers the least gain by this share: it may add noise.
+#: A free weight is the default if it lowers the least gain by at least this share, since it may add noise.
 WORTH_A_FREE_WEIGHT = 0.05
 
-#: With more states the filter with the other weight is not designed beside it: it takes as long as the one that is.
+#: With more states the filter with the other weight is not designed for comparison, since it takes as long.
 MOST_STATES_COMPARED = 8
 
 _PRICES = "What is shipped for each, and its H2 norm from unit noise on each output to the estimates:"
 
-#: So many times the noise is too much for a smaller gain that only a difference between nearly dependent outputs gives.
+#: Largest factor by which noise may grow for a smaller gain that uses differences of nearly dependent outputs.
 MOST_NOISE_FOR_GAIN = 1e4
 
-#: Coordinates in which a certificate is looked for before the gain is judged again.
+#: Number of coordinates in which a certificate is tried before the gain is computed again.
 FIRST_TRIES = 4
 
 
@@ -124,11 +125,11 @@ def _less_noisy(
     method: FaultEstimationFilter,
     progress: Callable[[str], None],
 ) -> Synthesis:
-    """Return the filter with nearly dependent outputs merged, or of one of them where that does not exist, where it is
-    less noisy, else the other.
+    """Return the filter with nearly dependent outputs merged if it has less noise, else the given one.
 
-    A gain on disturbances that is less by more than the margin is worth noise, but not any: a difference between
-    outputs that are equal but for the last digits of a linearisation decouples nothing of a real plant.
+    If no filter with merged outputs exists, one of these outputs is used alone.  A gain on disturbances that is smaller
+    by more than the margin is worth some noise, up to `MOST_NOISE_FOR_GAIN`: a difference between outputs that agree up
+    to the last digits of a linearisation decouples nothing in a real plant.
     """
     for merged in (near, picked_outputs(plant, near)):
         conditions, prepared = examine_fault_filter(merged.plant)
@@ -142,7 +143,7 @@ def _less_noisy(
     else:
         return made
     if not _is_as_labelled(other):
-        # A W that is the paper's of the merged outputs is another left inverse for those as given.
+        # The paper's W for merged outputs is another left inverse for the given outputs, and so a free one.
         other = replace(other, options={**other.options, "weight": "free"})
     least, gain = other.certificate.claims.get("gamma_min", 0.0), made.certificate.claims.get("gamma", 0.0)
     price = 1.0 if least <= (1.0 + method.gamma_margin) * gain else MOST_NOISE_FOR_GAIN
@@ -153,7 +154,7 @@ def _less_noisy(
 def _for_independent_outputs(
     choice: str, option: str, plant: DescriptorSystem, merged: MergedOutputs
 ) -> PreconditionError:
-    """Return the refusal of what is for independent outputs alone, with the option to leave out."""
+    """Return the error for a choice that requires independent outputs; it names the option to leave out."""
     return PreconditionError(
         f"{choice} is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
         f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave {option} out: a filter exists, and such "
@@ -163,20 +164,20 @@ def _for_independent_outputs(
 
 
 def _that_asks_for_it(method: FaultEstimationFilter) -> str:
-    """Return the option by which the paper's W is asked for."""
+    """Return the name of the option that requires the paper's W."""
     return "weight" if method.weight is not None else "gamma_search"
 
 
 def _is_as_labelled(made: Synthesis) -> bool:
-    """Whether W is the paper's where the options say so."""
+    """Whether W agrees with the option ``weight``: it is the paper's if the option says so."""
     return all(row.passed for row in weight_rows(made.gains, made.options["weight"]))
 
 
 def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthesis) -> Synthesis:
-    """Return the filter of a plant from that of it with merged outputs."""
+    """Return the filter of a plant from the filter for its merged outputs."""
     observer, weights, mean = synthesis.linear_observer, merged.weights, synthesis.options["mean"]
     work = with_sensor_faults_as_states(plant)
-    # Registers hold the estimates of the filter as it ships, to the last bit.
+    # The averaging registers must contain the estimates of the shipped filter to the last bit.
     observer = unaveraged(observer, mean) or observer if mean > 1 else observer
     observer = replace(observer, By=observer.By @ weights, Dy=observer.Dy @ weights, output_names=plant.output_names)
     gains = {name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in synthesis.gains.items()}
@@ -192,8 +193,11 @@ def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthe
 def _where_it_holds(
     synthesis: Synthesis, work: DescriptorSystem, gains: Mapping[str, FloatArray], weights: FloatArray
 ) -> Certificate:
-    """Return the certificate with a proof of the least gain that holds: of all filters, or of those that read merged
-    outputs.  What no gain sees of these may be visible by the rounding of dependent ones, to gains of any size."""
+    """Return the certificate with a valid proof of the least gain, of all filters or of those of merged outputs.
+
+    If neither proof is valid, the certificate has none.  Rounding of dependent outputs may make visible what merged
+    outputs do not show, to filters with gains of any size.
+    """
     certificate = synthesis.certificate
     if not LEAST_GAIN_WITNESSES & certificate.matrices.keys():
         return certificate
@@ -214,7 +218,7 @@ def _where_it_holds(
 
 
 def _is_prepared_without(plant: DescriptorSystem, prepared: PreparedPlant | None) -> bool:
-    """Whether the conditions were decided with fewer outputs, the merged ones."""
+    """Whether the conditions were decided for the merged outputs, which are fewer."""
     return prepared is None or prepared.plant.ny < plant.ny
 
 
@@ -234,10 +238,10 @@ def _synthesised(
     if remarks and plant.nx <= MOST_STATES_COMPARED:
         other = _of_other_weight(plant, conditions, prepared, replace(method, weight="paper" if free else "free"))
     problem, parts = gain_problem(prepared, free_weight=free)
-    # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
+    # If disturbances have no effect on the estimates, a small positive gain is proved instead.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
     if not free or limit is not None:
-        # The paper's W = Upsilon^+ is that of the outputs as given, not of balanced ones.
+        # The paper's W = Upsilon^+ is that of the given outputs, not of balanced ones.
         problem, parts = centred(problem, prepared, parts, weight=method.given_weight)
     elif plant.nw == 0:
         problem = with_output_noise(problem, parts)
@@ -266,7 +270,7 @@ def _synthesised(
         both = {free: price_in_words(level, gains, observer), not free: other}
         remarks = (*remarks, f"{_PRICES} Free W: {both[True]}. The paper's W: {both[False]}.")
     if method.mean > 1:
-        # Registers hold estimates, which see no state: nothing of the plant is tracked there.
+        # The averaging registers contain fault estimates, and so track no state of the plant.
         zeros = np.zeros(((method.mean - 1) * plant.nf, tracking.shape[1]))
         witnesses["tracking"] = np.vstack([tracking, zeros])
         observer = averaged(observer, method.mean)
@@ -289,7 +293,7 @@ def _synthesised(
 def _of_other_weight(
     plant: DescriptorSystem, conditions: Sequence[Condition], prepared: PreparedPlant, method: FaultEstimationFilter
 ) -> str | None:
-    """Return what the filter with the weight that is not taken gains and costs; ``None`` where there is none."""
+    """Return a text on gain and noise of the filter with the other weight; ``None`` if there is no such filter."""
     try:
         made = _synthesised(plant, conditions, prepared, replace(method, mean=1), silent)
     except ObsynthError:
@@ -300,9 +304,9 @@ def _of_other_weight(
 def weight_by_gain(
     plant: DescriptorSystem, prepared: PreparedPlant, method: FaultEstimationFilter
 ) -> tuple[bool, tuple[str, ...], LeastGain | None]:
-    """Return whether W is free; what a free W and the paper's give where both were compared, and the search of it.
+    """Return whether W is free, remarks on the comparison of a free W with the paper's, and the search for the gain.
 
-    By default W is free where the plant states noise, or where that lowers the least gain by `WORTH_A_FREE_WEIGHT`.
+    By default W is free if the plant states noise, or if a free W lowers the least gain by `WORTH_A_FREE_WEIGHT`.
     """
     if method.asks_for_free_weight is not None:
         return method.asks_for_free_weight, (), None
@@ -327,7 +331,7 @@ def _least(
     level: float,
     free_weight: bool,
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
-    """Return what is claimed of the least gain of any filter, and the witnesses."""
+    """Return the claims on the least gain of all filters, and their witnesses."""
     least = outcome.least
     proof, proved = least_gain_certificate(
         outcome.problem,
@@ -339,7 +343,7 @@ def _least(
         solver=method.solver,
         thorough=method.prove_least,
     )
-    # The search may end below what is proved, by its tolerance: no filter is there.
+    # By its tolerance the search may end below the proved bound, where no filter exists.
     claims = {"gamma_min": min(max(least.gain, proved), level)}
     if method.gamma_search == "bisection":
         low, high = least.bracket
@@ -356,7 +360,7 @@ def _shipped(
     *,
     tries: int | None,
 ) -> tuple[dict[str, FloatArray], tuple[LinearObserver, FloatArray, int], FloatArray, bool]:
-    """Return gains, their realisation, the certificate of the level that is claimed, and whether it proves that."""
+    """Return gains, their realisation, the certificate of the claimed level, and whether it proves that level."""
     gains = gains_in_given_units(prepared, parts, outcome.chosen)
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
     proof = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries)

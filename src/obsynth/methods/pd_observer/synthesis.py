@@ -1,7 +1,7 @@
 """PD observer: A. Filasova, D. Krokavec, V. Serbak, (4)-(6), Theorem 1 (40)-(44), Theorem 2 (61)-(65).
 
-Unlike the paper: P and Q are both variables in Theorem 2; the G of (25), which is in no theorem, acts inside the loop;
-what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps solvers from P3 close to singular.
+Deviations from the paper: P and Q are both variables in Theorem 2; the G of (25), which appears in no theorem, acts
+inside the loop; ``||[Y Z]||_F + ||P3||_F`` is minimised with ``P3 + P3' >= 2 I``, so that P3 is not close to singular.
 """
 
 from __future__ import annotations
@@ -36,46 +36,46 @@ from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merg
 from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 
-#: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
-#: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
+#: With the user's units of signals, the unit of time is the power of two nearest to so many times the inverse of the
+#: plant's fastest mode.  The objective then weighs J and L as for a plant with modes of a few 1/s in seconds.
 TIME_UNITS = 10.0
 
 #: By default errors should decay at least at this fraction of the plant's fastest mode.
 DECAY_SHARE = 0.1
 
-#: When the gains that this takes are out of proportion, less is tried.
+#: Shares of that rate that are tried in turn, until the gains are moderate.
 DECAY_RETRIES = (1.0, 0.3, 0.1, 0.03)
 
-#: Gains may grow by this factor for the sake of the default decay rate.
+#: Largest factor by which gains may grow for the default decay rate.
 DECAY_PRICE = 100.0
 
-#: In the plant's own units, gains of this size are small, whatever the smallest ones are.
+#: In the plant's own units, gains of at most this size count as small, even if smaller ones exist.
 SMALL_GAIN = 1.0
 
-#: With more unknown states the least of these rates comes first, in one set of units, and the first failure is the end.
+#: With more unknown states the rates are tried in increasing order, in one set of units, until one fails.
 MANY_UNKNOWN_STATES = 100
 
-#: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
+#: Default decay rates are at most this share of the decay rate of an unobservable mode, which no gain changes.
 HIDDEN_SHARE = 0.5
 
-#: With more unknown states the outputs are taken as they are: each choice of them takes the inequality again.
+#: With more unknown states no outputs are merged or left out, since the inequality is solved for each choice.
 MOST_UNKNOWNS_OF_CHOICES = 10
 
-#: Decay rates within this factor count as equal where outputs are merged or not.
+#: Decay rates that differ by at most this factor count as equal.
 AS_FAST = 1.001
 
 _CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
 
 
 class _Units(NamedTuple):
-    """Units in which the gains are found: what the augmented states, the outputs and the time are multiples of."""
+    """The units of the augmented states, the outputs and the time in which the gains are computed."""
 
     states: FloatArray
     outputs: FloatArray
     time: float
 
     def size(self, gains: PdGains) -> float:
-        """Return the spectral norm of ``[J L S]`` in these units, S from outputs straight to the estimates."""
+        """Return the spectral norm of ``[J L S]`` in these units; S is the feedthrough from outputs to estimates."""
         parts = [self.time * gains.J, gains.L, gains.observer.Dy[: len(self.states)]]
         return largest_singular_value(np.hstack([part * self.outputs for part in parts]) / self.states[:, None])
 
@@ -83,9 +83,10 @@ class _Units(NamedTuple):
 def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains to ship and the records of all solver runs.
 
-    Dependent outputs are merged; nearly dependent ones where that is as fast (with a stated ``decay``: reaches it) and
-    less noisy. Bounds on gains and noise are about the outputs as they are.  Where noise is stated, outputs that make
-    the estimates noisier are left out: the smallest gains do not see it.
+    Dependent outputs are merged.  Nearly dependent ones are merged if the observer is then as fast (with a stated
+    ``decay``: fast enough) and less noisy.  Bounds on gains and noise refer to the outputs as given, so that nothing is
+    merged with them.  If noise is stated, outputs that make the estimates noisier are left out, since the smallest
+    gains do not take noise into account.
     """
     as_they_are = method.gain_bound is not None or method.noise_gain is not None
     first, records = _merged_if_quieter(plant, method, as_they_are=as_they_are)
@@ -101,10 +102,10 @@ def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, 
     fewer = with_fewer_sensors(plant, lambda some: _of_merged(plant, method, some)[0], noise)
     candidates = [first, *fewer]
     rates = [-candidate.abscissa for candidate in candidates]
-    # A rate that is stated is reached by all; by default a faster one than the target was not asked for.
+    # All candidates reach a stated rate; by default, rates above the target are no advantage.
     wanted = 0.0 if method.decay else min(_target(plant), max(rates)) / AS_FAST
     deviations = [noise(one) if rate >= wanted else np.inf for one, rate in zip(candidates, rates, strict=True)]
-    # The first of those that are as quiet: with all outputs, where that is one of them.
+    # The first of the candidates with about the least noise, and so the one with all outputs if it is among them.
     quiet = next(i for i, deviation in enumerate(deviations) if deviation <= AS_QUIET * min(deviations))
     return candidates[quiet], records
 
@@ -112,7 +113,10 @@ def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, 
 def _merged_if_quieter(
     plant: DescriptorSystem, method: PdObserver, *, as_they_are: bool
 ) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains with outputs merged that depend, or nearly depend, on others, and the records of all runs."""
+    """Return the gains for merged outputs, where some depend or nearly depend on others, and the records of all runs.
+
+    With ``as_they_are`` no outputs are merged.
+    """
     choices = [None] if as_they_are else [merged_outputs(plant), nearly_merged_outputs(plant)]
     first, records = _of_merged(plant, method, choices[0])
     for merged in choices[1:]:
@@ -121,8 +125,8 @@ def _merged_if_quieter(
         try:
             other, more = _of_merged(plant, method, merged)
         except ObsynthError:
-            continue  # what the merged outputs leave unused is needed
-        # A rate that is stated is reached by both: a faster one was not asked for.
+            continue  # the differences between the outputs are needed
+        # Both reach a stated rate; a faster one is no advantage then.
         as_fast = bool(method.decay) or AS_FAST * other.abscissa <= first.abscissa
         if as_fast and fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
             first, records = other, [*records, *more]
@@ -132,7 +136,7 @@ def _merged_if_quieter(
 def _of_merged(
     plant: DescriptorSystem, method: PdObserver, merged: MergedOutputs | None
 ) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains of a plant from those of it with outputs merged."""
+    """Return the gains of a plant from the gains for its merged outputs."""
     if merged is None:
         return _gains_and_records(plant, method)
     gains, records = _gains_and_records(merged.plant, method)
@@ -144,9 +148,9 @@ def _of_merged(
 def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains and the records of all solver runs.
 
-    What decays as asked is small in the given units, or in the plant's own where noise is stated and less of it
-    reaches the faults.  A rate that is ours to choose is chosen, with its gains, in the plant's own units, so that it
-    is the same in any; only a higher one may come from the given units.
+    For a stated decay, the gains are the smallest in the user's units; if noise is stated, those in the plant's own
+    units are taken if less noise reaches the fault estimates.  A default decay and its gains are chosen in the plant's
+    own units, so that they do not depend on the user's; the user's units are used if they give a higher rate.
     """
     free = method.decay is None and method.disk is None
     has_objective = method.gain_bound is None and method.engines_for(plant.nx + plant.nf)[0] == "lmi"
@@ -159,7 +163,7 @@ def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdG
     if not free or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
-        # For many states as fast as the size of the gains allows: from the least rate upwards.
+        # For many states the rates are tried from the least one upwards, as long as the gains are moderate.
         faster, most = plain, DECAY_PRICE * _given_units(plant).size(plain)
         for share in sorted(DECAY_RETRIES):
             if share * target <= -plain.abscissa:
@@ -167,7 +171,7 @@ def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdG
             try:
                 faster = gains_for(plant, method, decay=share * target, most=most)
             except (SolverError, InfeasibleError):
-                break  # this rate was not asked for
+                break  # the user did not require this rate
         return faster, records
     gains = _faster(plant, method, plain, target, records, own=own)
     if own and gains.decay < target:
@@ -188,14 +192,17 @@ def _target(plant: DescriptorSystem) -> float:
 
 
 def _error_model(plant: DescriptorSystem, gains: PdGains) -> ErrorModel:
-    """Return what gains follow: the plant with its faults as states."""
+    """Return the error system of the gains, for the plant with constant faults as states."""
     nf = plant.nf
     return ErrorModel(plant, gains.observer, np.eye(plant.nx + nf), Phi=np.zeros((nf, nf)), Cw=np.eye(nf))
 
 
 def _less_noisy(plant: DescriptorSystem, method: PdObserver, plain: PdGains) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return gains of a stated decay in the given units, or in the plant's own: an output in a unit twice as large had
-    up to six times the noise at the estimates, as its gains seemed small."""
+    """Return the gains for a stated decay with less noise: those in the user's units, or those in the plant's own.
+
+    The smallest gains depend on the units: with one output in a unit twice as large, up to six times as much noise
+    reached the estimates.
+    """
     try:
         other = gains_for(plant, method, decay=plain.decay, own=True)
     except (SolverError, InfeasibleError):
@@ -213,7 +220,7 @@ def _faster(
     *,
     own: bool,
 ) -> PdGains:
-    """Return gains that decay as fast as moderate ones do, or ``plain``, the smallest; adds the records."""
+    """Return the fastest gains that are moderate, or ``plain``, the smallest gains; adds to the records."""
     units, least = (_own_units(plant), SMALL_GAIN) if own else (_given_units(plant), 0.0)
     most = DECAY_PRICE * max(units.size(plain), least)
     for share in DECAY_RETRIES:
@@ -225,7 +232,7 @@ def _faster(
             records.append(error.record)
             continue
         except InfeasibleError:
-            continue  # this rate was not asked for
+            continue  # the user did not require this rate
         records.append(faster.record)
         if units.size(faster) <= most:
             return faster
@@ -235,8 +242,11 @@ def _faster(
 def gains_for(
     plant: DescriptorSystem, method: PdObserver, *, decay: float, most: float | None = None, own: bool = False
 ) -> PdGains:
-    """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone.
-    The plant's ``own`` units come first, or those that suit the engine."""
+    """Return the first gains whose stability is proved, from several units of the plant.
+
+    The plant's ``own`` units are tried first, or else those that suit the engine.  With a bound ``most`` on the gains
+    only the first units are tried.
+    """
     delta = default_delta(plant, method, decay)
     require_possible(plant, method, delta=delta, decay=decay)
     failure = SolverError(
@@ -249,7 +259,7 @@ def gains_for(
             try:
                 gains = _solved(plant, method, name, delta, decay, units, most)
             except SolverError as error:
-                # What the spare engine meets says less than why it was needed.
+                # The error of the first engine is reported, not that of the engine that was tried instead.
                 failure = error if name == engine else failure
                 continue
             if gains is not None and gains.proved:
@@ -268,7 +278,8 @@ def _advice(method: PdObserver) -> str:
 
 
 def _units(plant: DescriptorSystem, method: PdObserver, *, balanced_first: bool, own_first: bool) -> Iterable[_Units]:
-    """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
+    """Return units of augmented states and outputs in the order to try them: the user's, balancing ones, and those in
+    which the plant's entries are near one."""
     candidates = [*_candidate_units(plant, method)]
     if method.gain_bound is not None:
         return candidates
@@ -279,18 +290,18 @@ def _units(plant: DescriptorSystem, method: PdObserver, *, balanced_first: bool,
     natural = _with_faults(rounded, users.time)
     if rounded.spread > FAR_UNITS:
         return [users, natural, *alternatives]
-    # A Riccati equation has no objective that would weigh gains in the user's units.
+    # The Riccati equation has no objective, so that the size of gains in the user's units does not matter to it.
     if balanced_first and len(alternatives) == 2:
         return [alternatives[0], users, alternatives[1], natural]
     return [users, *alternatives, natural]
 
 
 def _own_units(plant: DescriptorSystem) -> _Units:
-    """Return the plant's own units as they are: powers of two near them would hang on the given ones.
+    """Return the plant's own units, without rounding to powers of two, which would depend on the user's units.
 
-    With the fastest mode as the unit of rates, J and L weigh the same there.  A unit ten times longer makes L cheap:
-    noise then reaches the estimates several times larger.  So it does by an output that hardly shows the states but for
-    its noise, where that is stated: beside the others its unit is no less than its noise has it.
+    The inverse of the fastest mode is the unit of time, so that J and L have the same weight.  A unit ten times longer
+    would make L cheap, and the noise of the estimates several times larger.  An output with small signals and large
+    noise would have the same effect: if noise is stated, the unit of an output is at least proportional to its noise.
     """
     units = _with_faults(PlantUnits.of(plant), 1.0 / fastest_shown_mode(plant))
     noise = np.linalg.norm(plant.Dw, axis=1)
@@ -311,7 +322,7 @@ def _candidate_units(plant: DescriptorSystem, method: PdObserver) -> Iterator[_U
     time = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_shown_mode(plant)))))
     yield _given_units(plant)._replace(time=time)
     if method.gain_bound is not None:
-        return  # it is a bound in the user's units
+        return  # the bound is in the user's units
     augmented = with_faults_as_states(plant, _inner_gain(plant, method))
     system = np.zeros((n + ny, n + ny))
     system[:n, :n], system[n:, :n] = augmented.A, augmented.C
@@ -325,7 +336,7 @@ def _candidate_units(plant: DescriptorSystem, method: PdObserver) -> Iterator[_U
 
 
 def _inner_gain(plant: DescriptorSystem, method: PdObserver) -> FloatArray | None:
-    """Return the G to design with; a bound on the gains is on those in the loop, in the fault's own coordinates."""
+    """Return the G to design with; `None` with a bound on the gains, which refers to ``[J; G M]`` and ``[L; G N]``."""
     return None if method.gain_bound is not None else method.gain_matrix(plant.nf)
 
 
@@ -338,7 +349,7 @@ def _solved(
     units: _Units,
     most: float | None = None,
 ) -> PdGains | None:
-    """Return the gains found in some units, with a proved certificate where there is one."""
+    """Return the gains computed in some units, with a proved certificate if it could be proved."""
     states, outputs, unit = units
     task = _task(plant, method, delta, decay, units)
     if engine == "riccati":
@@ -447,7 +458,7 @@ def _resolved(method: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[
 
 
 def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: FloatArray | None) -> dict[str, FloatArray]:
-    """Return the paper's J, L, M, N (and G) of gains in the loop ``[J; G M]`` and ``[L; G N]``."""
+    """Return the paper's J, L, M, N (and G) from the gains ``[J; G M]`` and ``[L; G N]`` of the loop."""
     nx = plant.nx
     inner = np.eye(plant.nf) if g is None else g
     bottom = [np.asarray(np.linalg.solve(inner, part[nx:])) for part in (J, L)]
@@ -456,7 +467,7 @@ def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: Float
 
 
 def notes(plant: DescriptorSystem, method: PdObserver, gains: PdGains) -> tuple[str, ...]:
-    """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
+    """Return notes on the choice of delta and of the decay rate, and on outputs without use and noisy estimates."""
     texts = []
     if method.delta is None:
         less = ", or as much of it as the closed form serves" if gains.engine == "riccati" else ""

@@ -40,35 +40,37 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.verification.error_system import ErrorModel, contraction_of
 
-#: Rates below this, in 1/s, are those of an observer that does not settle.
+#: Least decay rate in 1/s, which avoids a division by zero for an observer that does not settle.
 SLOWEST = 1e-300
 
-#: A filter is as fast as another one where its slowest error needs this many times as long.
+#: Two filters count as equally fast if their settling times differ by at most this factor.
 AS_FAST = 1.001
 
-#: How often a default whose stability is not proved becomes half as fast.
+#: How often the rate of a default observer is halved if its stability is not proved.
 MOST_SLOWER = 6
 
-#: Of a filter that is noisier, only one that is so many times as fast is worth it.
+#: A noisier filter is taken only if it is at least so many times as fast as the quieter one.
 FAR_SLOWER = 3.0
 
-#: A default this many times slower than the plant itself is worth a note.
+#: A note is given if the default observer is so many times slower than the plant.
 SLOW_DEFAULT = 1000.0
 
-#: A region with a radius and no decay asks for at most this share of its radius.
+#: For a region with a radius and without a decay, the decay is at most this share of the radius.
 RADIUS_SHARE = 0.5
 
-#: Shares of the drive that are tried for a decay that is stated, while each is quieter than the last: the default is of
-#: the size of all sensors' noise, and a noisy sensor more made the filter faster than asked, and noisier.
+#: Shares of the assumed process noise that are tried in turn for a stated decay, as long as each lowers the noise.  The
+#: default of that noise is of the size of all sensors' noise; an additional noisy sensor therefore made the filter
+#: faster than necessary, and noisier.
 DRIVES = (1.0, 1e-1, 1e-2, 1e-3)
 
-#: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
+#: Decay rates of placed poles in units of the stated decay: from the first number on, spread over the second one, so
+#: that the poles are distinct and none is on the bound.
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
 class Choice(NamedTuple):
-    """A gain, the poles that were asked for, what is claimed of it, records of solvers, and, of a default, its decay as
-    a share of the plant's own rate."""
+    """A gain, the stated poles, the claims, the records of solvers, and the decay of a default gain as a share of the
+    plant's own rate."""
 
     gain: FloatArray
     poles: Sequence[complex] | None
@@ -80,7 +82,7 @@ class Choice(NamedTuple):
 def notes(
     known: Existence, problem: PlacementProblem, method: UiPiObserver, claims: Mapping[str, float]
 ) -> Iterator[str]:
-    """Yield notes on eliminated states, fixed poles, a slow default and digits, where these matter."""
+    """Yield notes on eliminated states, fixed poles, a slow default observer and necessary digits."""
     if known.transformation is not None:
         detail = next(condition.detail for condition in known.conditions if condition.name.startswith("(D1)"))
         yield f"(D1) holds only without the algebraic states, which were eliminated: {detail}."
@@ -88,7 +90,7 @@ def notes(
     if fixed.size:
         slow, least = method.slowest_asked(dt), np.min(decay_rates(fixed, dt))
         behind = slow is not None and least < slow
-        # A pole at z = 0 comes out as rounding has it.
+        # A pole at z = 0 is computed only up to rounding.
         printed = np.where(np.abs(fixed) > NEGLIGIBLE_MODE, fixed, 0.0) if dt > 0.0 else fixed
         yield (
             f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(printed))}"
@@ -197,8 +199,10 @@ def _chosen_outputs(
 def _slower(
     plant: DescriptorSystem, method: UiPiObserver, synthesis: Synthesis, *, progress: Callable[[str], None]
 ) -> Synthesis | None:
-    """Return a slower observer than one by default whose stability is not proved, as its gains are too large for double
-    precision; ``None`` where none is found."""
+    """Return a slower observer whose stability is proved, or ``None``.
+
+    The gains of the default observer are too large to prove its stability in double precision.
+    """
     decay = synthesis.certificate.claims.get("decay", 0.0)
     for halvings in range(1, MOST_SLOWER + 1 if decay > 0.0 else 1):
         rate = decay * 2.0**-halvings
@@ -217,8 +221,8 @@ def _slower(
 
 
 def _require_stable_fixed_modes(problem: PlacementProblem) -> None:
-    """Raise `PreconditionError` where the matrices of the options fix a mode that is not stable."""
-    # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
+    """Raise `PreconditionError` if E_sharp, C_sharp and G of the options fix a mode that is not stable."""
+    # A mode on the boundary up to rounding is not stable either: a lost equation leaves a mode at zero.
     modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
     unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
     if unstable:
@@ -233,10 +237,12 @@ def _require_stable_fixed_modes(problem: PlacementProblem) -> None:
 def _without_likeness(
     known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
 ) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
-    """Return which outputs to merge where some nearly depend on others, with the problem and its gain where these were
-    computed for the comparison.  Placed poles do not see the noise: the quieter one is taken.  Of two defaults that are
-    as fast as their noise allows, the one with the outputs as they are is taken where it is faster and no noisier, or
-    far faster."""
+    """Return the outputs to merge if some nearly depend on others, with the problem and its gain if both were computed.
+
+    The design with merged outputs is compared with the one without.  For given poles the quieter one is taken.  For
+    default gains, the merged outputs are taken if they give a filter that is at least as fast, or a quieter one that is
+    not much slower (`FAR_SLOWER`).
+    """
     near = nearly_merged_outputs(known.plant)
     if near is None:
         return merged, None
@@ -256,7 +262,7 @@ def _without_likeness(
 
 
 class _Compared(NamedTuple):
-    """A choice of outputs to merge: deviation of the faults, settling time, and the problem with its gain."""
+    """A choice of outputs to merge: deviation of the fault estimates, settling time, and the problem with its gain."""
 
     noise: float
     settling: float
@@ -270,9 +276,11 @@ def _with_quietest_outputs(
     merged: MergedOutputs | None,
     tried: tuple[PlacementProblem, Choice] | None,
 ) -> tuple[MergedOutputs | None, tuple[PlacementProblem, Choice] | None]:
-    """Return which outputs to take for given poles, with the problem and its gain: of all choices, the least noisy.
+    """Return the choice of outputs with the least noise for given poles, with the problem and its gain.
 
-    Gains with these poles are searched from well-conditioned ones, which no noise chose, whatever a sensor adds."""
+    The search for gains with these poles starts from well-conditioned gains, which do not depend on the noise, so that
+    an additional sensor may add noise.
+    """
 
     def designed(some: MergedOutputs) -> tuple[MergedOutputs, _Compared]:
         alone = existence(some.plant, model)
@@ -302,10 +310,11 @@ def _compared(
     chosen: tuple[PlacementProblem, Choice] | None = None,
     like: float | None = None,
 ) -> _Compared | None:
-    """Return what a choice of outputs comes to, for a gain that is ``chosen`` or looked for; ``None`` where it has no
-    gain.
+    """Return noise, settling time and gain for a choice of outputs; ``None`` if there is no gain.
 
-    ``like``: the share of the plant's rate that the default has with other outputs."""
+    ``chosen`` is the problem with its gain if they are known.  ``like`` is the decay of the default gain with other
+    outputs, as a share of the plant's rate.
+    """
     try:
         problem, choice = chosen or _problem_and_choice(known, model, method, merged, weights, like=like)
     except (ObsynthError, np.linalg.LinAlgError):
@@ -340,8 +349,11 @@ def _problem_and_choice(
 def _placed(
     problem: PlacementProblem, poles: Sequence[complex], objective: str, noise: KalmanProblem | None = None
 ) -> Choice:
-    """Return the gain for given poles; where gains shall be small, that is in the user's units if outputs are not
-    mixed.  ``noise``: what these leave free is spent on; then no units of the user count."""
+    """Return the gain for given poles.
+
+    If the gains should be small, their size is measured in the user's units, unless outputs are mixed.  With ``noise``
+    the freedom that remains is used to reduce the noise, and the user's units do not matter.
+    """
     split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.undisturbed, np.eye(plant.ny))
     plain_outputs = plain_outputs and noise is None
@@ -372,7 +384,7 @@ def _chosen(
     *,
     like: float | None = None,
 ) -> Choice:
-    """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
+    """Return a gain of the observable part, with its poles if they are stated, its claims and its records."""
     split, time = problem.split, problem.units.time
     if method.poles is not None:
         poles = checked_poles(method.poles, split.order, problem.fixed_modes, dt)
@@ -386,7 +398,8 @@ def _chosen(
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, method)
         runs = (record,)
     elif method.decay is not None:
-        # What the user says of the drive is not ours to change; without a rate nothing else makes errors decay.
+        # A process noise that the user states is not changed, nor is it reduced if the decay is zero, since then only
+        # this noise makes errors decay.
         own = method.decay > 0.0 and weights.keys().isdisjoint(("process", "fault"))
         drives = DRIVES if own else DRIVES[:1]
         gain = _for_decay(problem, kalman, method.decay, method.objective, dt, drives=drives)
@@ -403,11 +416,12 @@ def _as_fast_as(
     default: tuple[PlacementProblem, FloatArray, Mapping[str, float]],
     weights: Mapping[str, Any],
 ) -> tuple[PlacementProblem, FloatArray, Mapping[str, float]]:
-    """Return the pair of the plant that is designed for, a default gain of it, and what is claimed: those that came
-    out, or ones that are as fast as those of ``alone``, with one sensor of each kind.
+    """Return the problem, a default gain and its claims: those of ``default``, or faster ones.
 
-    Where process noise is stated and sensors are repeated, the least noise is less, and the same price buys a slower
-    filter.  The gain of one sensor alone has the same poles with the mean of several, and less noise."""
+    ``alone`` is the problem with one sensor of each kind.  If process noise is stated and sensors are repeated, the
+    least noise is smaller, so that the same ratio to the least noise gives a slower filter.  The gain for one sensor,
+    applied to the mean of several, has the same poles and less noise than with that sensor alone.
+    """
     problem, gain, claims = default
     single = kalman_problem(alone, weights)
     fair = compromise(single, alone.rate)
@@ -442,9 +456,11 @@ def _for_decay(
     *,
     drives: Sequence[float] = DRIVES[:1],
 ) -> FloatArray:
-    """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
+    """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): of a Kalman filter, or by placement.
 
-    Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
+    Near the fastest possible rate, the Riccati equation of the filter can be solved on one processor and not on
+    another, because of rounding; poles are placed then.
+    """
     rate = problem.units.time * decay
     gain = kalman.quietest_gain(rate, drives=drives)
     if gain is None:
@@ -467,7 +483,8 @@ def _for_decay(
 def _in_region(
     kalman: KalmanProblem, region: NamedRegion, rate: float, method: UiPiObserver
 ) -> tuple[FloatArray, dict[str, Any]]:
-    """Return a gain for the region; without a decay, with that of the default: least noise alone hardly moves."""
+    """Return a gain for the region; if that has no decay, with the default decay, since a filter of least noise alone
+    may be very slow."""
     if method.region.get("decay") is None:
         fair = compromise(kalman, rate)
         most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
@@ -475,6 +492,6 @@ def _in_region(
         try:
             return region_gain(kalman, tried, solver=method.solver)
         except SolverError:
-            # What was asked may be possible all the same.
+            # The region without that decay may still be possible.
             pass
     return region_gain(kalman, region, solver=method.solver)
