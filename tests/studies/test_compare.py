@@ -65,6 +65,7 @@ def test_refused_methods_say_why_in_one_line(bicycle: obsynth.Comparison) -> Non
     )
     assert bicycle["descriptor-kalman"].refused == "estimates the state, but no fault"
     assert all("\n" not in text for text in bicycle.refusals)
+    assert any(text.startswith("pd-observer: assumes more than this plant has") for text in bicycle.refusals)
 
 
 def test_numbers_of_the_table_are_those_of_a_simulation(bicycle: obsynth.Comparison) -> None:

@@ -278,7 +278,8 @@ class Comparison:
     @property
     def refusals(self) -> tuple[str, ...]:
         """Methods that do not exist, each with the reason in one line."""
-        return tuple(f"{entry.method}: {entry.refused}" for entry in self.methods if entry.refused)
+        refused = ((entry.method, entry.refused) for entry in self.methods if entry.refused)
+        return tuple(f"{method}: {text.removeprefix(f'{method} ')}" for method, text in refused)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data."""
