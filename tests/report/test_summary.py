@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.optimize import brentq
 
 import obsynth
@@ -235,6 +236,26 @@ def test_the_time_to_90_percent_is_the_observer_s_not_of_the_clock_of_a_slow_pla
     design = obsynth.ui_pi_observer(plant, poles=[-40.0, -50.0])
     passed = brentq(lambda t: 1.0 - 5.0 * np.exp(-40.0 * t) + 4.0 * np.exp(-50.0 * t) - 0.9, 1e-3, 1.0)
     assert followed_steps(design)["f1"].most == pytest.approx(passed, rel=0.01)
+
+
+def test_the_time_to_90_percent_is_that_of_the_estimate_where_a_feedback_holds_an_unstable_plant():
+    """The observer, sampled by itself, took the held inputs of the feedback as lines, which moved its estimate."""
+    plant = obsynth.DescriptorSystem(
+        None, [[1.0, 0.0], [0.0, -1.0]], [[0.02], [1.0]], [[1.0, 1.0], [1.0, -1.0]], D=[[1.0], [1.0]],
+        Bf=[[1.0], [0.0]], sensor_noise={"y1": 0.01, "y2": 0.01},
+    )  # fmt: skip
+    design = obsynth.pd_observer(plant)
+    observer, row = design.observer, design.observer.fault_rows.start
+    joint = np.block([[plant.A, np.zeros((2, observer.order))], [observer.By @ plant.C, observer.Az]])
+    shown = np.concatenate([observer.Dy[row] @ plant.C, observer.Cz[row]])
+    fault = np.concatenate([plant.Bf[:, 0], np.zeros(observer.order)])
+
+    def missing(t: float) -> float:
+        step = scipy.linalg.expm(t * np.block([[joint, fault[:, None]], [np.zeros((1, len(fault) + 1))]]))[:-1, -1]
+        return float(shown @ step - 0.9)
+
+    passed = brentq(missing, 0.1, 3.0)
+    assert passed <= followed_steps(design)["f1"].most <= 1.01 * passed
 
 
 @pytest.mark.long

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.linear_recursions import impulse_responses
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -38,7 +39,24 @@ HELD_GROWTH, LARGEST_STEP_GROWTH = 1e3, 1e6
 
 
 @dataclass(frozen=True)
-class FaultFigures:
+class StepFigures:
+    """What becomes of a unit step of one fault in its estimate; fields as of `FaultFigures`."""
+
+    fault: str
+    half: float
+    most: float
+    at_horizon: float
+    peak: float
+    horizon: float
+
+    @property
+    def reaches(self) -> bool:
+        """Whether a step is there at the horizon."""
+        return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
+
+
+@dataclass(frozen=True)
+class FaultFigures(StepFigures):
     """What becomes of a unit step of one fault, of noise and of unknown inputs, in its estimate.
 
     Parameters
@@ -67,20 +85,9 @@ class FaultFigures:
     ('f1', True)
     """
 
-    fault: str
-    half: float
-    most: float
-    at_horizon: float
-    peak: float
-    horizon: float
     deviation: float
     unknown_input_gain: float
     unknown_input_share: float
-
-    @property
-    def reaches(self) -> bool:
-        """Whether a step is there at the horizon."""
-        return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
 
 
 def largest_gain(figures: Iterable[FaultFigures]) -> float:
@@ -192,16 +199,43 @@ def _figures(
         sizes = alike[plant.fault_names.index(name)]
         shares = np.divide(gains, sizes, out=np.zeros_like(gains), where=sizes > 0.0)
         yield FaultFigures(
-            name,
-            _first(own >= DELAY_SHARE, plant.dt),
-            _first(own >= NEARLY_ALL, plant.dt),
-            float(own[-1]),
-            float(np.max(np.abs(own))),
-            len(own) * plant.dt,
+            *_of_step(name, own, plant.dt),
             float(np.sqrt(np.sum(noise[:, row] ** 2))),
             float(np.max(gains, initial=0.0)),
             float(np.max(shares, initial=0.0)),
         )
+
+
+def step_figures_between_samples(
+    plant: DescriptorSystem, observer: LinearObserver, step: float, steps: int
+) -> tuple[StepFigures, ...]:
+    """Return what becomes of steps that last, on a continuous plant with its continuous observer, every ``step``
+    seconds.
+
+    Both are followed together, exactly: the observer sampled by itself takes outputs and inputs as lines between its
+    samples, which a jump of the fault and inputs that a feedback holds are not."""
+    followed, feedback = steps_in_bounds(on_the_clock(plant, step), steps)
+    own = without_algebraic_states(plant).plant
+    moved, signals = _held(own, stabilising_feedback(own) if feedback.any() else None)
+    rows = observer.fault_rows
+    into, through = np.hstack([observer.By, observer.Bu]), np.hstack([observer.Dy, observer.Du])[rows]
+    direct = np.vstack([own.Df, np.zeros((own.nu, own.nf))])
+    a = np.block([[moved, np.zeros((own.nx, observer.order))], [into @ signals, observer.Az]])
+    transition, driven = zero_order_hold(a, np.vstack([own.Bf, into @ direct]), step)
+    shown = np.hstack([through @ signals, observer.Cz[rows]])
+    responses = np.concatenate([(through @ direct)[None], impulse_responses(transition, driven, shown, followed - 1)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        of_steps = np.cumsum(responses, axis=0)
+        return tuple(
+            StepFigures(*_of_step(name, of_steps[:, row, own.fault_names.index(name)], step))
+            for row, name in enumerate(observer.fault_names)
+        )
+
+
+def _of_step(name: str, estimates: FloatArray, dt: float) -> tuple[str, float, float, float, float, float]:
+    """Return the fields of `StepFigures` from the estimates of a unit step."""
+    half, most = (_first(estimates >= share, dt) for share in (DELAY_SHARE, NEARLY_ALL))
+    return name, half, most, float(estimates[-1]), float(np.max(np.abs(estimates))), len(estimates) * dt
 
 
 def _first(reached: NDArray[np.bool_], dt: float) -> float:

@@ -17,12 +17,16 @@ from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.candidates import SETTLING_SAMPLES
-from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.fault_figures import (
+    StepFigures,
+    fault_figures,
+    on_the_clock,
+    step_figures_between_samples,
+)
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -284,7 +288,7 @@ def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserve
     return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
 
 
-def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
+def followed_steps(design: ObserverDesign) -> Mapping[str, StepFigures]:
     """Return what becomes of a unit step of each fault of a linear design, by fault, none where they could not be
     followed."""
     pair = _estimating(design)
@@ -296,31 +300,31 @@ def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SETTLING_SAMPLES
     length = STEP_SETTLING_TIMES * settling_time(plant)
     steps = int(min(max(length / step, 20), MOST_STEP_SAMPLES))
+    figures: tuple[StepFigures, ...]
     try:
-        sampled = on_the_clock(plant, step)
-        clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
+        if plant.dt > 0.0:
+            figures = fault_figures(on_the_clock(plant, step), observer, steps)
+        else:
+            figures = step_figures_between_samples(plant, observer, step, steps)
+            figures = _closely_timed(plant, observer, figures, step)
     except ObsynthError:
         return {}
-    figures = fault_figures(sampled, clocked, steps)
-    if plant.dt == 0.0:
-        figures = _closely_timed(plant, observer, figures, step)
     return {fault_step.fault: fault_step for fault_step in figures}
 
 
 def _closely_timed(
-    plant: DescriptorSystem, observer: LinearObserver, figures: tuple[FaultFigures, ...], step: float
-) -> tuple[FaultFigures, ...]:
+    plant: DescriptorSystem, observer: LinearObserver, figures: tuple[StepFigures, ...], step: float
+) -> tuple[StepFigures, ...]:
     """Return figures whose times to 90 % are known to one in `SETTLING_SAMPLES`: the plant's settling time, by which
     they were sampled, may be long beside these."""
     for _ in range(MOST_CLOSER_LOOKS):
         coarse = [figure.most for figure in figures if figure.reaches and 0.0 < figure.most < SETTLING_SAMPLES * step]
         if not coarse:
             break
-        # The straight lines between samples may show a step by up to two of these too soon.
         length, step = max(coarse) + 2.0 * step, min(coarse) / SETTLING_SAMPLES
         steps = int(min(length / step, MOST_STEP_SAMPLES))
         try:
-            closer = fault_figures(on_the_clock(plant, step), sample_observer(observer, step), steps)
+            closer = step_figures_between_samples(plant, observer, step, steps)
         except ObsynthError:
             break
         figures = tuple(
@@ -331,7 +335,7 @@ def _closely_timed(
 
 
 def design_warnings(
-    design: ObserverDesign, steps: Mapping[str, FaultFigures], *, reported: Collection[str] = ()
+    design: ObserverDesign, steps: Mapping[str, StepFigures], *, reported: Collection[str] = ()
 ) -> tuple[str, ...]:
     """Return what to know before trusting the fault estimates; ``steps`` from `followed_steps`."""
     pair = _estimating(design)

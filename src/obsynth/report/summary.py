@@ -17,7 +17,7 @@ from rich.text import Text
 
 from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
-from obsynth.methods.fault_figures import FaultFigures
+from obsynth.methods.fault_figures import StepFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import REGISTRY, method_class
@@ -178,7 +178,7 @@ def print_summary(shown_summary: Summary, *, console: Console) -> None:
         console.print(Text(text, style=style), soft_wrap=True)
 
 
-def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
+def _facts(design: ObserverDesign, steps: Mapping[str, StepFigures]) -> Iterator[tuple[str, str]]:
     known = method_class(design.method) if design.method in REGISTRY else None
     yield "method", design.method + (f": {known.summary}" if known else "")
     yield from _engine(design)
@@ -282,7 +282,7 @@ def _dynamics(design: ObserverDesign) -> str:
     return f"the error {share}; {order}"
 
 
-def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
+def _speed(design: ObserverDesign, steps: Mapping[str, StepFigures]) -> Iterator[tuple[str, str]]:
     """Yield how soon the estimates show a step, where that is later than their delays say."""
     if not steps:
         return
@@ -346,7 +346,7 @@ def _is_identity(covariance: object) -> bool:
     return isinstance(covariance, np.ndarray) and np.array_equal(covariance, np.eye(len(covariance)))
 
 
-def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:
+def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, StepFigures]) -> Iterator[str]:
     """Yield what a user should not overlook: disturbances that look like faults, steps that are not followed."""
     if isinstance(design.plant, DescriptorSystem):
         yield from questions(design.plant)
