@@ -1,4 +1,4 @@
-"""From a plant to a verified design: the only module that calls analysis, synthesis and verification in turn."""
+"""From a plant to a verified design: analysis, synthesis and verification in turn."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ from obsynth.verification.constant_faults import CONSTANT_FAULT
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 
-#: Two plants are one where the entries of each matrix agree to this share of its largest: rounding of an elimination in
-#: units of its own, or of a sampling that is done again.
+#: Two plants count as the same if the entries of each matrix agree to this share of its largest entry: an elimination
+#: in other units, or a repeated sampling, differs by rounding.
 SAME_PLANT = 1e-9
 
-#: Gains whose estimates may miss more of a constant fault are not offered with a larger steady_error_limit.
+#: A larger steady_error_limit is suggested up to this share of a constant fault that estimates may miss.
 LARGEST_STEADY_ERROR = 0.1
 
 
@@ -66,12 +66,13 @@ def design(
     Parameters
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
-        The plant, or what `discretise` and `eliminate_algebraic_states` return: its way back is kept then.
-        Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
+        The plant, or the result of `discretise` or `eliminate_algebraic_states`, whose map back to the original states
+        is kept.  Algebraic states of a plant with sparse matrices and 500 states or more are eliminated first.
     method : str, optional
         Method id; for its options see the function of the same name, such as `fault_estimation_filter`.  By default
-        ``auto``: every method that exists and has the options given is designed, and the best by closed-form figures
-        (reach of a step, gain from the unknown inputs, noise against delay) is taken; the design names it.
+        ``auto``: observers of all methods that exist and have the given options are designed, and the best one by
+        closed-form figures (reach of a step, gain from the unknown inputs, noise against delay) is returned; the design
+        names its method.
     name : str, optional
         Name of the design.
     recovery : StateRecovery, optional
@@ -79,8 +80,8 @@ def design(
     progress : callable, optional
         Called with a text at the start of each stage.
     scenario : Scenario, optional
-        What the plant is expected to do: for guaranteed tests of plants with tolerances, and for ``auto``, which takes
-        noise, sample time and sizes of faults from it.
+        The expected operation of the plant: for guaranteed tests of plants with tolerances, and for ``auto``, which
+        takes noise, sample time and sizes of faults from it.
     **options
         Options of the method.
 
@@ -97,7 +98,7 @@ def design(
         No such observer exists for this plant; the failing condition, mode and signals are named, and what to measure
         (or to leave out) so that one does.
     InfeasibleError
-        A checked certificate proves that what was asked cannot be reached.
+        A checked certificate proves that no observer meets the options.
     SolverError
         The solver gave no usable answer: the result is inconclusive.
     VerificationError
@@ -159,9 +160,10 @@ def design(
 
 
 def _for_region(plant: Plant, options: Mapping[str, Any]) -> list[str]:
-    """Return the methods that exist over the region of a polytopic plant with these options; one that does not, else.
+    """Return the methods that exist over the region of a polytopic plant with these options; if none does, one of them.
 
-    Several only where no certificate may be found although the first exists: for faults that turn with the scheduling.
+    There are several only for faults whose direction depends on the scheduling: although the first method exists, its
+    design may find no certificate.
     """
     faulty = isinstance(plant, PolytopicSystem) and plant.nf > 0
     known = [method for method in methods_for("polytopic") if "faults" in method_class(method).purposes or not faulty]
@@ -177,7 +179,7 @@ def _for_region(plant: Plant, options: Mapping[str, Any]) -> list[str]:
 
 
 def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any]) -> None:
-    """Refuse a continuous plant with delays; which methods exist for it on samples is tried before it is said."""
+    """Refuse a continuous plant with delays; the message names the methods that exist for the sampled plant."""
     own = plant.plant if isinstance(plant, Transformation) else plant
     if not isinstance(own, DescriptorSystem) or not own.delays or own.is_discrete:
         return
@@ -206,9 +208,9 @@ def _designed(
     advise: bool,
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> ObserverDesign:
-    """Return the verified design of one method; with ``advise`` a refusal says what would help.
+    """Return the verified design of one method.
 
-    ``more``: what the synthesis takes besides.
+    With ``advise`` an error says what would make a design possible.  ``more`` are further arguments of the synthesis.
     """
     for condition in kind_conditions(plant, type(method)):
         condition.require()
@@ -235,7 +237,7 @@ def _designed_on(
     advise: bool,
     more: Mapping[str, Any],
 ) -> ObserverDesign:
-    """Return the verified design for the plant that a method works on."""
+    """Return the verified design for the plant as the method needs it."""
     plant, recovery, notes = working.plant, working.recovery, working.notes
     method = working.method or method
     try:
@@ -267,7 +269,8 @@ def _designed_on(
 
 
 def _error_that_is_reached(missed: float) -> float | None:
-    """Return what estimates of constant faults miss, in two digits rounded up; ``None`` where that is too much."""
+    """Return the share of a constant fault that estimates miss, rounded up to two digits; ``None`` if it is too
+    large."""
     if not missed <= LARGEST_STEADY_ERROR:
         return None
     digit = 10.0 ** (math.floor(math.log10(missed)) - 1)
@@ -275,7 +278,8 @@ def _error_that_is_reached(missed: float) -> float | None:
 
 
 def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery: StateRecovery | None) -> str:
-    """Return which other method is verified for a plant whose constant faults rounding of one method's gains hides."""
+    """Return a sentence on another method that is verified for a plant, where rounding of the gains of ``method`` makes
+    its estimates miss constant faults."""
     alternatives = [
         other for other in methods_for(kind_of(plant)) if "steady_error_limit" in field_types(method_class(other))
     ]
@@ -294,24 +298,24 @@ def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery:
 
 @arguments_checked
 def check(plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None) -> MethodReports:
-    """Return, for every method, the report of its existence conditions; what fails is a row.
+    """Return, for every method, a report with a row for each of its existence conditions.
 
-    Nothing is designed but for a plant over a region (`PolytopicSystem`): where its points have observers, a small one
-    is designed to see whether one certificate covers the region.
+    Nothing is designed, except for a plant over a region (`PolytopicSystem`): if observers exist at its points, a small
+    one is designed to find out whether one certificate is valid over the region.
 
     Parameters
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem, DAEModel or Transformation
         The plant.
     options : mapping, optional
-        Options by method id, of which those that the conditions depend on are used, such as ``fault_model``; those of
-        ``auto`` are for every method that has them all.
+        Options by method id, such as ``fault_model``; only those that the conditions depend on are used.  Options of
+        ``auto`` apply to every method that has all of them.
 
     Returns
     -------
     dict of str to VerificationReport
-        By method id; a design by the method can exist where ``passed`` is true.  Its text says for each method whether
-        one can, or the first condition that fails.
+        Reports by method id; an observer of the method can exist if ``passed`` is true.  As text, a line for each
+        method says so, or names the first condition that fails.
 
     Raises
     ------
@@ -339,7 +343,7 @@ def check(plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]
                 own = working_plant(own, None, silent, None).plant
             return _checked(own, options or {})
     except PreconditionError as error:
-        # The sparse plant as written has no reduced form for any method.
+        # The sparse plant cannot be reduced, whatever the method.
         row = Condition(
             error.condition,
             "algebraic states that can be eliminated",
@@ -377,7 +381,8 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> MethodRe
 
 
 def _over_region(plant: Plant, method: Method, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return whether one certificate covers the region of a polytopic plant, where its points have observers."""
+    """Return the condition that one certificate is valid over the region of a polytopic plant, if observers exist at
+    its points."""
     if not isinstance(plant, PolytopicSystem) or not all(condition.holds for condition in conditions):
         return []
     each = partial(_designed, plant, method, name="design", recovery=None, progress=silent, advise=False)
@@ -386,16 +391,16 @@ def _over_region(plant: Plant, method: Method, conditions: Sequence[Condition]) 
 
 
 def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:
-    """Return the condition that fails where a design needs what neither the plant nor the options state."""
+    """Return the failed condition for data that a design needs and that neither the plant nor the options state."""
     signals, unclear = (error.signals, error.unclear) if isinstance(error, PreconditionError) else ((), False)
     claim, detail = "what a design needs is stated", str(error).removeprefix("Unclear: ")
     return Condition("stated", claim, False, np.nan, np.nan, method, detail, signals=signals, unclear=unclear or None)
 
 
 def _existence(plant: Plant, method: Method) -> Sequence[Condition]:
-    """Return a method's existence conditions, and where they hold one for what a design needs and nobody states.
+    """Return a method's existence conditions; if they are satisfied, also a failed one for data that are not stated.
 
-    Where its numbers fail, one says so: the other methods go on.
+    If the conditions cannot be computed, the result is a condition that says so, since other methods go on.
     """
     try:
         conditions = method.existence(plant)
@@ -419,11 +424,11 @@ def _existence(plant: Plant, method: Method) -> Sequence[Condition]:
 def draft_of(
     plant: Plant, method: str, synthesis: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
-    """Return the design that a synthesis stands for, without a report."""
+    """Return the design from a synthesis, without a report."""
     designed_for, source = plant, source_of(plant)
     if synthesis.plant is not None:
         if recovery is not None and isinstance(plant, DescriptorSystem) and synthesis.plant.nx > plant.nx:
-            # Unknown inputs and noise that are estimated as states come after the plant's own.
+            # States for estimated unknown inputs and noise come after the plant's own states.
             leading = np.eye(plant.nx, synthesis.plant.nx)
             recovery = recovery.then(unchanged_states(plant, plant, from_state=leading))
         plant = synthesis.plant
@@ -447,8 +452,11 @@ def draft_of(
 
 
 def _source_of_recovery(source: PlantSource | None, recovery: StateRecovery | None) -> PlantSource | None:
-    """Return the source that a way back leads to; ``None`` where it leads further back, to a plant as written that is
-    too large to be held: then the way back cannot be done again."""
+    """Return the source whose states a recovery returns.
+
+    The result is ``None`` if the recovery returns states of an earlier plant that is too large to be stored, so that
+    the recovery cannot be computed again.
+    """
     if source is None or recovery is None:
         return source
     try:
@@ -464,7 +472,7 @@ def verified(
     """Return the design with its report."""
     draft = with_stored_errors(draft_of(plant, method, synthesis, name=name, recovery=recovery))
     linear = isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem)
-    # First: which rows gains fail that hide a fault is a matter of this machine's rounding.
+    # Checked first: with gains that hide a fault, the failing rows would depend on the rounding of this machine.
     notes = require_above_rounding(*draft.linear) if linear else ()
     report = verify(draft)
     if not report.passed:
@@ -482,7 +490,7 @@ def verified(
 
 
 def _what_fails(report: VerificationReport) -> str:
-    """Return which rows the gains fail, and why where that is known, as the beginning of a message."""
+    """Return the beginning of a message on the rows that the gains fail, with the reason if it is known."""
     if _misses_constant_faults_alone(report):
         row = report[CONSTANT_FAULT]
         return (
@@ -503,7 +511,7 @@ def _misses_constant_faults_alone(report: VerificationReport) -> bool:
 def design_from_gains(
     plant: Plant | Transformation, method: str, *, name: str = "design from gains", **gains: Any
 ) -> ObserverDesign:
-    """Put gains from a paper or another program into a design, with its report; nothing is refused.
+    """Make a design with its report from gains of a paper or of another program, even if checks fail.
 
     Parameters
     ----------
@@ -517,10 +525,10 @@ def design_from_gains(
         In the letters of the method's paper.
 
         ``fault-estimation-filter``: ``T (nx, nx)``, ``N (nx, ny)``, ``L (nx, ny)``, ``W (nf, ny)`` of [Wang2015];
-        ``gamma`` (dimensionless), the claimed bound on the l2 gain, needed when the plant has disturbances;
-        ``indexes``, the detectability index of each fault (19): samples by which its estimate lags.  They are found
-        from T by default, which needs all of its digits: where an index is above one, ``C T f_i`` must vanish, and with
-        a rounded T it does not.
+        ``gamma`` (dimensionless), the claimed bound on the l2 gain, needed if the plant has disturbances;
+        ``indexes``, the detectability index of each fault (19), the number of samples by which its estimate lags.  By
+        default they are computed from T, which then needs all of its digits: for an index above one, ``C T f_i`` must
+        vanish, and with a rounded T it does not.
 
         ``pd-observer``: ``J, L (nx, ny)`` and ``M, N (nf, ny)`` of [Filasova], nx after elimination of algebraic
         states; ``adaptation_gain``, G ``(nf, nf)`` of (25), inside the loop; ``decay`` (1/seconds), the claimed rate.
@@ -531,13 +539,13 @@ def design_from_gains(
     Returns
     -------
     ObserverDesign
-        Its certificate is computed from the gains.  Its report may hold failed checks: look at ``report.passed``, or
+        Its certificate is computed from the gains.  Its report may contain failed checks: see ``report.passed``, or
         call `obsynth.verify` with the number of printed digits.
 
     Raises
     ------
     SpecError
-        A gain is missing, unknown or of the wrong shape, or the method reads none.
+        A gain is missing, unknown or of the wrong shape, or the method has no gains that can be given.
     PreconditionError
         No such observer exists for this plant.
 
@@ -577,8 +585,7 @@ def design_from_gains(
 
 
 def _with_tolerances_of(original: Plant, shipped: Any) -> Any:
-    """Return the shipped plant with the tolerances of the given one, or with the note that they are not carried
-    over."""
+    """Return the shipped plant with the tolerances of the given one, or with the reason why it has none."""
     if not (isinstance(original, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
         return shipped
     uncertain = original.uncertainty
@@ -595,7 +602,7 @@ def _with_tolerances_of(original: Plant, shipped: Any) -> Any:
 
 
 def agree(first: DescriptorSystem, second: DescriptorSystem) -> bool:
-    """Whether the matrices of two plants are the same but for rounding."""
+    """Whether the matrices of two plants are equal up to rounding."""
     pairs = [(getattr(first, name), getattr(second, name)) for name in UNCERTAIN_MATRICES]
     return all(
         a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_PLANT * np.abs(a).max(initial=0.0))) for a, b in pairs
@@ -603,7 +610,7 @@ def agree(first: DescriptorSystem, second: DescriptorSystem) -> bool:
 
 
 def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
-    """Return a linear design whose certificate claims what rounding of its stored numbers adds to the errors."""
+    """Return a linear design whose certificate also bounds the errors that rounding of its stored numbers adds."""
     method = method_class(draft.method)
     with np.errstate(all="ignore"):
         base = before_the_mean(draft)[0] if method.averaged else draft

@@ -1,4 +1,4 @@
-"""The gain and the weight that make the transfer from the unknown inputs co-inner; how much is left of the faults."""
+"""Synthesis of the detection filter: gain and weight that make the transfer function of the unknown inputs co-inner."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from obsynth.results.design import Certificate
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.norm_proofs import Transfer, added_gain, error_transfer, gain_is_proved, sensitivity_is_proved
 
-#: The grid of frequencies begins at this share of its end, where the band begins at zero.
+#: If the band begins at zero, the logarithmic grid of frequencies begins at this share of the largest frequency.
 LEAST_FREQUENCY = 1e-6
 
-#: The proved gain is the first of these above one, and the proved sensitivity the first below what a grid finds, with
-#: which the proof is above the rounding of its numbers.
+#: Margins that are tried in turn until the proof is not spoilt by rounding: the proved gain is above one, and the
+#: proved sensitivity below the least value on the grid, by one of these.
 GAIN_MARGINS, SENSITIVITY_MARGINS = (1e-6, 1e-4, 1e-2), (1e-4, 1e-3, 1e-2, 0.1, 0.5)
 
-#: Share of the room that a bound leaves which strictness of the inequality takes: the other half is for rounding.
+#: Share of the slack of a bound that makes the inequality strict; the rest is for rounding.
 STRICTNESS = 0.5
 
-#: A state with less than this share of the largest variance is none that noise reaches, up to rounding.
+#: A state whose variance is less than this share of the largest one counts as not reached by noise.
 UNREACHED = 1e-12
 
-#: Frequencies of the grid, and how often the least value is refined between its neighbours.
+#: Number of frequencies of the grid, and of refinements of the least value between its neighbours.
 GRID_FREQUENCIES, GRID_REFINEMENTS = 400, 40
 
 
@@ -74,8 +74,8 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
         state_delays=(),
         fault_delays=(),
     )
-    felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
-    bound, witness = _proved_gain(felt, units)
+    disturbed = error_transfer(smooth, observer, *unknown_inputs(smooth))
+    bound, witness = _proved_gain(disturbed, units)
     if witness is None:
         raise SolverError(
             "The Riccati equation of the detection filter has no solution for which a gain can be proved in double "
@@ -86,11 +86,11 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
         )
     low, high = _band(observer) if method.band is None else (float(value) for value in method.band)
     least, where = _sensitivity(smooth, observer, low, high)
-    reached = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
+    faulty = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
     levels = [least * (1.0 - margin) for margin in SENSITIVITY_MARGINS]
     claims = {
         "disturbance_gain": bound,
-        "fault_sensitivity": _first_proved(levels, lambda level: sensitivity_is_proved(reached, level, low, high)),
+        "fault_sensitivity": _first_proved(levels, lambda level: sensitivity_is_proved(faulty, level, low, high)),
         "band_from": low,
         "band_to": high,
         "frequency": where,
@@ -106,13 +106,15 @@ def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progre
 
 
 def _band(observer: LinearObserver) -> tuple[float, float]:
-    """Return the band from zero to the fastest mode of a filter; where it has none all frequencies are alike."""
+    """Return the default band, from zero to the fastest mode of the filter; to 1 rad/s if the filter has no states."""
     return 0.0, float(np.max(np.abs(np.linalg.eigvals(observer.Az)), initial=0.0)) or 1.0
 
 
 def _first_proved(levels: Sequence[float], is_proved: Callable[[float], bool]) -> float:
-    """Return the first of falling levels that is proved, or zero: where the lowest has no proof none has, and a failure
-    takes seconds."""
+    """Return the first of falling levels that is proved, or zero if there is none.
+
+    The lowest level is tried second: if it cannot be proved, no other can, and each failure takes seconds.
+    """
     if is_proved(levels[0]):
         return levels[0]
     lower = levels[1:] if is_proved(levels[-1]) else ()
@@ -121,8 +123,10 @@ def _first_proved(levels: Sequence[float], is_proved: Callable[[float], bool]) -
 
 @dataclass(frozen=True, eq=False)
 class _OwnUnits:
-    """Units of states and time of a plant's own, and of outputs in which each has a noise near one: powers of two.
-    Equations are solved in these, so that whether they are solved does not hang on those of the data."""
+    """The plant's own units of states and time, and units in which the noise of each output is near one.
+
+    All are powers of two.  The equations are solved in these units, so that success does not depend on the user's.
+    """
 
     states: FloatArray
     outputs: FloatArray
@@ -140,7 +144,7 @@ class _OwnUnits:
         return factors * a * self.states, factors * b
 
     def scaled(self, plant: DescriptorSystem) -> DescriptorSystem:
-        """Return the plant in these units; unknown inputs keep theirs, in which they are as large as one."""
+        """Return the plant in these units; the unknown inputs, whose size is one, keep theirs."""
         (a, bd), bw = self.moved(plant.A, plant.Bd), self.moved(plant.A, plant.Bw)[1]
         output_factors = self.outputs[:, None]
         return plant.replace(
@@ -158,7 +162,7 @@ class _OwnUnits:
 
 
 def _proved_gain(transfer: Transfer, units: _OwnUnits) -> tuple[float, FloatArray | None]:
-    """Return the least bound of the gain that is proved, and the matrix ``(n, n)`` that does."""
+    """Return the least proved bound of the gain, and the matrix ``(n, n)`` that proves it."""
     for bound in (1.0 + margin for margin in GAIN_MARGINS):
         for witness in _gain_witnesses(transfer, bound, units):
             if gain_is_proved(transfer, bound, witness):
@@ -167,11 +171,11 @@ def _proved_gain(transfer: Transfer, units: _OwnUnits) -> tuple[float, FloatArra
 
 
 def _gain_witnesses(transfer: Transfer, bound: float, units: _OwnUnits) -> Iterator[FloatArray]:
-    """Yield matrices ``(n, n)`` that may prove a gain above one of a co-inner transfer.
+    """Yield matrices ``(n, n)`` that may prove a bound above one on the gain of a co-inner transfer function.
 
-    The covariance X of its states for unit noise solves the bounded real inequality at one, with equality: its other
-    blocks vanish.  A larger bound has room for ``X + eps S``, ``a S + S a' = -Q``, which makes it strict.  Q is as
-    large as the rounding of X: by the states' own variances, where noise reaches them.
+    The covariance X of its states for unit noise satisfies the bounded real inequality for the bound one with equality.
+    For a larger bound, ``X + eps S`` with ``a S + S a' = -Q`` satisfies it strictly.  The entries of Q are proportional
+    to the variances of the states, as the rounding errors of X are; states that noise does not reach get a least one.
     """
     parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
     a, b, c, d = (part.midpoint for part in parts)
@@ -209,7 +213,7 @@ def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[st
 
 
 def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
-    """Return L ``(nx, ny)`` and V ``(ny, ny)`` that make the transfer from the unknown inputs co-inner."""
+    """Return L ``(nx, ny)`` and V ``(ny, ny)`` that make the transfer function of the unknown inputs co-inner."""
     b, d = unknown_inputs(plant)
     measured = d @ d.T
     y = continuous_solution(plant.A, plant.C, b @ b.T, measured, b @ d.T)
@@ -224,7 +228,7 @@ def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 
 def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, high: float) -> tuple[float, float]:
-    """Return the least singular value from the faults to the residuals on a band, and where."""
+    """Return the least singular value from the faults to the residuals on a band, and its frequency."""
     errors = ErrorModel(plant, observer, np.eye(plant.nx))
     output_map, direct, _, _ = errors.residual_output
 

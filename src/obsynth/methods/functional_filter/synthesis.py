@@ -1,7 +1,8 @@
 """The functional filter: estimates of chosen faults, or residuals that they affect.
 
-After `decouple` a Kalman filter on inputs u *and* y, faults as walks of their models.  Source: ours; null space: Frisk,
-Nyberg (2001); fixed lag: Anderson, Moore (1979, ch. 7).
+The unknown inputs are decoupled (`decouple`).  A Kalman filter with the inputs u and y then estimates the faults, whose
+models are driven by random walks.  The method is our own, with the null space of Frisk, Nyberg (2001) and the fixed lag
+of Anderson, Moore (1979, ch. 7).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from obsynth.verification.inequalities import slowest_decay, stability_factor
 
 _ModelGain: TypeAlias = tuple[FilterModel, KalmanGain]
 
-#: Errors that need longer than so many times the settling time are mentioned.
+#: A note is given if errors last longer than so many times the settling time.
 SLOW_ERRORS = 20.0
 
 
@@ -73,7 +74,7 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
             break
     progress("building the realisation and its certificate")
     if gains and contraction_of(observer) is None:
-        # Entries that cancel hide that it is stable.
+        # Stability cannot be proved if large entries cancel; a triangular form has no such entries.
         parts = _parts(gains, method, triangular=True)
         observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, method))
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
@@ -107,7 +108,7 @@ def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: C
 
 
 def _state_parts(plant: DescriptorSystem, model: Exosystem, method: FunctionalFilter) -> list[FilterPart]:
-    """Return the filter of the states asked for, if any."""
+    """Return the filter of the states that the user chose, if any."""
     places = chosen_states(method.states, plant)
     if not places:
         return []
@@ -126,7 +127,7 @@ def _state_parts(plant: DescriptorSystem, model: Exosystem, method: FunctionalFi
 
 
 def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> bool:
-    """Whether rounding of the outputs leaves something of the estimates."""
+    """Whether the estimates are larger than the effect of rounding of the outputs."""
     try:
         require_above_rounding(plant, observer)
     except PreconditionError:
@@ -135,7 +136,7 @@ def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> boo
 
 
 def _parts(gains: Sequence[_ModelGain], method: FunctionalFilter, *, triangular: bool = False) -> list[FilterPart]:
-    """Return the filters of the gains, see `filter_part`."""
+    """Return the filter of each model with its gain (`filter_part`)."""
     delay = 0 if method.poles is not None else method.delay
     return [
         filter_part(model, gain, whitening(gain.innovation), delay=delay, mean=method.mean, triangular=triangular)
@@ -146,8 +147,8 @@ def _parts(gains: Sequence[_ModelGain], method: FunctionalFilter, *, triangular:
 def _gains(
     plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter, longer: int
 ) -> tuple[list[_ModelGain], list[FloatArray], list[tuple[float, float, bool]]]:
-    """Return models of the filters with their gains, the walks of their fault models' states, and when steps are seen
-    with walks by default."""
+    """Return the models of the filters with their gains, the random-walk intensities of the states of fault models, and
+    the times in which steps of faults are estimated with default intensities."""
     if method.poles is not None and models:
         return _placed(plant, models, method), [np.zeros(model.drive.shape[1]) for model in models], []
     stated_rates = method.rates(plant)
@@ -177,8 +178,10 @@ def _low_order_note(plant: DescriptorSystem, models: Sequence[FilterModel]) -> s
 def _low_order(
     plant: DescriptorSystem, model: FilterModel, method: FunctionalFilter
 ) -> tuple[FilterModel, FloatArray, KalmanGain] | None:
-    """Return a model of low order with its walks and gain, where the plant is large, no option chooses the gains, and
-    steps are estimated as soon as they should be."""
+    """Return a model of low order with its random-walk intensities and gain, or ``None``.
+
+    There is one if the plant is large, no option determines the gains, and steps are estimated in time.
+    """
     if method.fault_rate is not None or method.decay is not None or not is_large(model):
         return None
     seconds = settling_time(plant)
@@ -214,7 +217,7 @@ def _gain(
 
 
 def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter) -> list[_ModelGain]:
-    """Return gains with the poles asked for: one list, or one for each of several filters."""
+    """Return gains with the poles of the options: one list, or one list for each of several filters."""
     pole_sets = [method.poles] if len(models) == 1 else list(method.poles)
     if len(pole_sets) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in pole_sets):
         orders = ", ".join(str(len(model.A)) for model in models)
@@ -258,7 +261,7 @@ def _resolved(
     rates: Sequence[FloatArray],
     estimated: Sequence[int],
 ) -> dict[str, Any]:
-    """Return the options as plain data, for the gain set."""
+    """Return the options with chosen defaults as plain data for the gain set."""
     options = method.as_plain()
     options["faults"] = (
         None
@@ -272,7 +275,7 @@ def _resolved(
 
 
 def _silent_sensor_notes(plant: DescriptorSystem, gains: Sequence[_ModelGain]) -> list[str]:
-    """Return the note on sensors without noise that a gain is held to have."""
+    """Return the note on sensors without stated noise for which the gains assume some."""
     silent = [name for name, row in zip(plant.output_names, plant.Dw, strict=True) if not row.any()]
     share = max((gain.shares[1] for _, gain in gains), default=0.0)
     if not plant.nw or not silent or not share:

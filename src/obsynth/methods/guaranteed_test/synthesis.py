@@ -1,4 +1,4 @@
-"""The weights of the least threshold, by linear programmes whose answers are then proved."""
+"""Synthesis of the guaranteed test: weights of the least threshold, by linear programmes whose solutions are proved."""
 
 from __future__ import annotations
 
@@ -52,25 +52,25 @@ from obsynth.simulation.linear import scenario_runs, scenario_stepper
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.over_tolerances.error_structure import error_structure
 
-#: A threshold below this share of what all bounds could do is tried as an exact zero.
+#: If the threshold is below this share of the effect of all bounds together, weights with an exact zero are tried.
 ZERO_THRESHOLD = 1e-9
 
-#: Another machine's columns of moving disturbances differ by rounding: a factor.
+#: Factor of thresholds for moving disturbances, whose columns differ by rounding on another machine.
 COLUMN_ROOM = 1.0 + 1e-9
 
-#: The table of samples against threshold in a certificate.
+#: Name of the table of numbers of samples and thresholds in a certificate.
 TRADE_OFF = "trade_off"
 
-#: The method whose observer runs beside a test: faults do not move its state estimate.
+#: Method of the observer that runs beside a test; faults do not affect its state estimate.
 BESIDE = "fault-estimation-filter"
 
-#: Samples of the scenario over which thresholds are compared, at most.
+#: Largest number of samples of the scenario over which thresholds are compared.
 MOST_COMPARED_SAMPLES = 500
 
-#: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
+#: A programme with so many equations took so many seconds; times grow with this power of the number of equations.
 MEASURED_EQUATIONS, MEASURED_SECONDS, TIME_GROWTH = 1800, 2.3, 2.3
 
-#: Seconds below which no number is given, and from which on minutes are.
+#: Shorter times are printed without a number, and longer ones than the second number in minutes.
 SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 
@@ -81,8 +81,11 @@ def synthesise(
     progress: Callable[[str], None],
     scenario: Scenario | None = None,
 ) -> Synthesis:
-    """Return weights, observer and certificate; with a scenario the threshold over the tolerances of the plant's
-    constants is least in the mean over it, without its faults."""
+    """Return weights, observer and certificate.
+
+    With a scenario, the weights minimise the mean over this scenario, without its faults, of the threshold that is
+    valid over the tolerances of the plant's constants.
+    """
     beside, notes = None, []
     if scenario is not None and isinstance(plant, DescriptorSystem):
         try:
@@ -117,7 +120,8 @@ def synthesise(
 def _observer_beside(
     options: TestOptions, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
 ) -> Beside:
-    """Return the observer of the state, and what it says of a scenario without its faults."""
+    """Return the observer of the state beside the test, with its estimates and thresholds on a scenario without
+    faults."""
     if options.state_bounds or options.initial_bounds:
         raise PreconditionError(
             "Bounds of states and tolerances do not go together: leave state_bounds and initial_bounds out.",
@@ -158,21 +162,21 @@ def _observer_beside(
 def chosen_samples(
     problem: WindowProblem, options: TestOptions, beside: Beside | None
 ) -> tuple[int, FloatArray, Mapping[int, Optimum]]:
-    """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optima by
-    row; where each row has a window of its own some rows are tried, and the worst one counts.
+    """Return the number of samples, the tried numbers with their thresholds ``(tried, 2)``, and the optima by row.
 
-    With tolerances the table has a third column, the mean threshold over the record, which decides, and the
-    multipliers are those that make it least.
+    If each row has a window of its own, some rows are tried, and the largest threshold counts.  With tolerances the
+    table has a third column, the mean threshold over the record, by which the number is chosen; the multipliers then
+    minimise that mean.
     """
     stated_samples = samples_given(options)
     tried = problem.ladder() if stated_samples == "auto" else (int(stated_samples),)
     if beside is not None:
         tried = tuple(rung for rung in tried if rung <= beside.longest()) or tried[:1]
-    # Rows that have a window of every length.
+    # Only rows that have a window of every tried length.
     rows = problem.tried(tried[-1])
     optima_by_length: list[list[Optimum]] = []
     for rung in reversed(tried):
-        # More samples never raise a threshold: where there is no test, there is none on fewer.
+        # More samples never raise a threshold: if there is no test on these, there is none on fewer.
         hopeless = bool(optima_by_length) and problem.horizon is None and not np.isfinite(optima_by_length[0][0].size)
         windows = (problem.window(rung, row=row) for row in rows)
         optima_by_length.insert(
@@ -186,7 +190,7 @@ def chosen_samples(
             raise SolverError(
                 f"HiGHS finds no test on {tried[-1]} samples, but there is one: inconclusive. Other units may help."
             )
-        # No length tells the fault at all of these rows: the longest tells it at most of them.
+        # No length gives a test at all of these rows; the longest one gives a test at the most of them.
         return tried[-1], table, dict(zip(rows, optima_by_length[-1], strict=True))
     if beside is not None:
         wider = [
@@ -197,14 +201,14 @@ def chosen_samples(
         optima_by_length = [
             [replace(own, multipliers=more.multipliers)] for (own,), more in zip(optima_by_length, wider, strict=True)
         ]
-    # With tolerances more samples may be worse.
+    # With tolerances, more samples may raise the mean threshold.
     good = table[:, -1] <= (1.0 + WITHIN) * np.min(table[:, -1])
     place = int(np.flatnonzero(good)[0])
     return tried[place], table, dict(zip(rows, optima_by_length[place], strict=True))
 
 
 def in_time(states: int, samples: int) -> str:
-    """Return about how long the linear programme of a window takes, in words."""
+    """Return a text on the approximate time that the linear programme of a window takes."""
     seconds = MEASURED_SECONDS * (states * samples / MEASURED_EQUATIONS) ** TIME_GROWTH
     if seconds < SHORT_SECONDS:
         return "a few seconds"
@@ -212,18 +216,18 @@ def in_time(states: int, samples: int) -> str:
 
 
 class Shipped:
-    """What is proved of a window: multipliers, a witness, and both claims."""
+    """The proofs for a window: multipliers with their threshold, and a witness with the least threshold."""
 
     def __init__(self, test: NearbySolution, threshold: float, witness: NearbySolution | None, least: float) -> None:
         self.test, self.threshold, self.witness, self.least = test, threshold, witness, least
 
 
 def proved_test(window: Window, optimum: Optimum) -> Shipped:
-    """Return the proved test next to a solution; raise `SolverError` where nothing can be proved."""
+    """Return the proved test near a solution of a linear programme; raise `SolverError` if there is no proof."""
     if optimum.multipliers is None or optimum.point is None:
         raise SolverError("The linear programme is unbounded on this window: the result is inconclusive.")
     rows, _ = window.scales
-    # What all bounds together could do to these weights.
+    # The largest effect of all bounded signals together, if no terms cancelled.
     able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(optimum.multipliers) @ window.bar[window.bounded])
     if optimum.size <= ZERO_THRESHOLD * able and not window.standing:
         exact = repaired_multipliers(window.outer, optimum.multipliers, refine=True, exact_zero=True)
@@ -298,7 +302,7 @@ def _synthesis(
 def _by_programme(
     problem: WindowProblem, programmes: WindowProgrammes, shipped: list[Shipped | None]
 ) -> dict[str, FloatArray]:
-    """Return what is proved of each different window, a row for each, and which of them each row of a record has."""
+    """Return the proofs for each different window, one row for each, and the window that each row of a record has."""
     windows, empty = programmes.windows, NearbySolution(np.zeros(1), np.zeros(1))
     tests = [empty if proved is None else proved.test for proved in shipped]
     continued = [
@@ -326,13 +330,13 @@ def _by_programme(
 
 
 def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
-    """Return rows of different lengths as a matrix, with zeros at their ends."""
+    """Return rows of different lengths as a matrix, filled with zeros."""
     width = max(width, *(len(row) for row in rows))
     return np.array([np.pad(row, (0, width - len(row))) for row in rows])
 
 
 def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: NearbySolution | None) -> bool:
-    """Whether a witness, where there is one to show, is a course of a plant that runs before and after the window."""
+    """Whether a witness, if there is one, is a trajectory of a plant that runs before and after the window."""
     if witness is None:
         return problem.continues(window, row)
     return problem.is_of_a_running_plant(window.inner, row, witness.values, witness.radius)

@@ -1,4 +1,4 @@
-"""The gain of an observer over a region and its certificate: inequalities at the corners of slopes, then the proof."""
+"""Synthesis of an observer over a region: inequalities at the corners of the slopes' ranges, and their proof."""
 
 from __future__ import annotations
 
@@ -44,46 +44,48 @@ from obsynth.verification.nonlinear_region import (
 )
 from obsynth.verification.over_region import GAIN_WITNESSES, rows_of_euler, stored_witness
 
-#: Bounds of slopes are stored a little wider: on another processor elementary functions may differ in the last digit.
+#: The stored bounds of slopes are wider by this share, since elementary functions of another processor may differ in
+#: the last digit.
 SLOPE_ROOM = 1e-9
-#: How far above the least level a gain is sought: gains near the least one are large.
+#: Margin above the least level with which a gain is designed, since gains near the least level are large.
 DESIGN_MARGIN = 2e-2
-#: The largest gain that rates alone may ask for, in units of the plant's own, and the fastest rate.
+#: Largest gain, and fastest rate, of a design for the fastest decay, in the plant's own units.
 DECAY_LIMIT = 1e2
-#: The rate that a certificate allows at one corner is computed in floating point: what is tried begins above it.
+#: The search for a proved rate begins at this factor times the rate that a certificate allows at one corner, which is
+#: computed in floating point.
 FASTEST_ROOM = 1.01
-#: Noise on states that nothing drives, as a share of that on the others, where sizes of errors are estimated.
+#: Assumed noise on states without noise, relative to that on the others, where sizes of errors are estimated.
 LEAST_DRIVE = 1e-3
-#: How far a level may be raised where that of the scaled problem just misses the proof of the shipped numbers.
+#: Shares by which a level is raised in turn until it can be proved for the shipped numbers.
 PROOF_ROOMS = (0.0, 1e-6, 1e-4, 1e-3, 1e-2)
 
 
-def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DAEModel, options: RegionObserverMethod, *, progress: Callable[[str], None]) -> Synthesis:
     """Return an observer over a region with its certificate; see `obsynth.region_observer`."""
-    asked.require_stated(plant)
-    solver = chosen_solver(asked.solver, asked.solver_options)
-    faults = asked.fault_names(plant)
-    step = asked.sample_time or 0.0
+    options.require_stated(plant)
+    solver = chosen_solver(options.solver, options.solver_options)
+    faults = options.fault_names(plant)
+    step = options.sample_time or 0.0
     progress("enclosing the slopes of the nonlinearities over the region")
-    require_all(asked.existence(plant))
+    require_all(options.existence(plant))
     terms = nonlinear_terms(plant, faults=faults)
-    region = OperatingRegion.of(terms, asked.region)
+    region = OperatingRegion.of(terms, options.region)
     slopes = region.slopes()
     bounds = _stored_bounds(slopes)
-    drive = _drive(terms, region, asked, step)
-    given_gain = _given_gain(terms, asked.gains)
+    drive = _drive(terms, region, options, step)
+    given_gain = _given_gain(terms, options.gains)
     progress("solving the inequalities for the slopes")
-    problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
-    solution = problem.solved(asked, given_gain, solver, progress)
+    problem = _Scaled.of(terms, region, slopes, bounds, drive, options.goal)
+    solution = problem.solved(options, given_gain, solver, progress)
     progress("proving the shipped numbers")
-    claims, matrices = _proved(terms, slopes, bounds, drive, solution, asked, problem, progress)
+    claims, matrices = _proved(terms, slopes, bounds, drive, solution, options, problem, progress)
     gain = solution.gain
-    start = named_vector(asked.initial_state, (*plant.state_names, *faults), _nominal(plant, faults), "initial_state")
+    start = named_vector(options.initial_state, (*plant.state_names, *faults), _nominal(plant, faults), "initial_state")
     places = [(*plant.state_names, *faults).index(name) for name in terms.names]
     observer = RegionObserver(
         plant,
         faults,
-        dict(asked.region),
+        dict(options.region),
         bounds,
         gain,
         start[places],
@@ -91,12 +93,12 @@ def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callab
         step,
     )
     return Synthesis(
-        asked.as_plain(),
+        options.as_plain(),
         {"L": gain},
         observer,
         Certificate(matrices, claims),
         {"engine": "lmi", "runs": solution.runs},
-        (*_notes(region, observer, asked), *_noise_notes(terms, slopes, bounds, gain, asked)),
+        (*_notes(region, observer, options), *_noise_notes(terms, slopes, bounds, gain, options)),
     )
 
 
@@ -107,12 +109,12 @@ def _stored_bounds(slopes: tuple[Slope, ...]) -> FloatArray:
 
 
 def _drive(
-    terms: NonlinearTerms, region: OperatingRegion, asked: RegionObserverMethod, step: float
+    terms: NonlinearTerms, region: OperatingRegion, options: RegionObserverMethod, step: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    wanted = wanted_of(terms, region, asked.wanted)
-    if asked.goal == "decay" and asked.noise is None:
+    wanted = wanted_of(terms, region, options.wanted)
+    if options.goal == "decay" and options.noise is None:
         return np.zeros((len(terms.names), 0)), np.zeros((len(terms.output_names), 0)), wanted
-    return (*drive_of(terms, asked.noise, step), wanted)
+    return (*drive_of(terms, options.noise, step), wanted)
 
 
 def _given_gain(terms: NonlinearTerms, gains: Any) -> FloatArray | None:
@@ -131,7 +133,7 @@ def _nominal(plant: DAEModel, faults: tuple[str, ...]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A gain with its Lyapunov matrices in the plant's units."""
+    """A gain with its Lyapunov matrices, in the plant's units."""
 
     gain: FloatArray
     witness: Witness
@@ -142,7 +144,8 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Scaled:
-    """The error system at the corners in units in which it is near one: states, equations, outputs and time."""
+    """The error system at the corners, in units of states, equations, outputs and time in which its entries are near
+    one."""
 
     errors: ErrorPolytope | SlopedErrors
     states: FloatArray
@@ -161,7 +164,7 @@ class _Scaled:
         drive: tuple[FloatArray, FloatArray, FloatArray],
         goal: str,
     ) -> _Scaled:
-        """Return the error system at every corner; of more slopes than have corners that of the middle, with them."""
+        """Return the error system at every corner; for many slopes, that at the middle, with the slopes beside it."""
         W, Wy, V = directions(terms, slopes)
         nd = terms.differential
         few = len(slopes) <= MOST_CORNER_SLOPES
@@ -192,47 +195,47 @@ class _Scaled:
         return cls(errors if few else sloped, states, rows, outputs, time, nd)
 
     def solved(
-        self, asked: RegionObserverMethod, given: FloatArray | None, solver: str, progress: Callable[[str], None]
+        self, options: RegionObserverMethod, given: FloatArray | None, solver: str, progress: Callable[[str], None]
     ) -> _Solution:
         """Return a gain with its certificate."""
         own = None if given is None else self._gain_in(given)
-        decay = None if not asked.decay else asked.decay * self.time
-        if asked.goal == "decay":
+        decay = None if not options.decay else options.decay * self.time
+        if options.goal == "decay":
             if decay is not None:
                 raise SpecError("goal: decay finds the fastest decay: leave decay out.", path="decay")
             witness, gain = self._fastest(own, progress)
             outside = self._witness_out(witness)
             return _Solution(self._gain_out(gain, given), outside, outside, None, ())
-        options: dict[str, Any] = {
-            "goal": asked.goal,
+        arguments: dict[str, Any] = {
+            "goal": options.goal,
             "margin": DESIGN_MARGIN if given is None else 0.0,
             "decay": decay,
             "solver": solver,
-            "settings": asked.solver_options,
+            "settings": options.solver_options,
         }
         if isinstance(self.errors, SlopedErrors):
-            block = certified_slopes(self.errors, gain=own, **options)
+            block = certified_slopes(self.errors, gain=own, **arguments)
             of_level, of_decay = self._witness_out(block.witness), self._witness_out(block.of_decay)
             return _Solution(self._gain_out(block.gain, given), of_level, of_decay, block.level, block.runs)
         corners, gains = self.errors, None if own is None else [own]
         made = solved_at_needed(
             corners,
-            lambda some: certified(some, gain="constant", gains=gains, **options),
-            lambda found: lack_of_level(corners, found, asked.goal, decay),
+            lambda some: certified(some, gain="constant", gains=gains, **arguments),
+            lambda found: lack_of_level(corners, found, options.goal, decay),
             progress,
         )
         witness = self._witness_out(made.witness)
         return _Solution(self._gain_out(made.gains[0], given), witness, witness, made.level, made.runs)
 
     def decay_of(self, gain: FloatArray, progress: Callable[[str], None]) -> Witness | None:
-        """Return Lyapunov matrices of the fastest decay of a gain; ``None`` where the search has no result."""
+        """Return Lyapunov matrices for the fastest decay of a gain; ``None`` if the search has no result."""
         try:
             return self._witness_out(self._fastest(self._gain_in(gain), progress)[0])
         except SolverError:
             return None
 
     def _fastest(self, gain: FloatArray | None, progress: Callable[[str], None]) -> tuple[Witness, FloatArray]:
-        """Return Lyapunov matrices of the fastest decay, of a gain or of the best one, and the gain."""
+        """Return Lyapunov matrices for the fastest decay, and the gain: the given one, or by default the best one."""
         if isinstance(self.errors, SlopedErrors):
             _, witness, best = best_decay_of_slopes(self.errors, gain=gain, limit=DECAY_LIMIT)
             return witness, best
@@ -262,18 +265,21 @@ class _Scaled:
         P = 0.5 * (P + P.T)
         P[nd:], P[:, nd:] = 0.0, 0.0
         G = witness.P[0] if witness.G is None else witness.G[0]
-        # G' multiplies the equations: its columns are theirs, its rows the states'.
+        # G' multiplies the equations: its columns belong to equations, and its rows to states.
         G = (G.T / s[:, None] * columns).T
         G[:nd, :nd] = P[:nd, :nd]
         G[:nd, nd:] = 0.0
-        # A multiplier stands between errors in the same units: V e and what the slopes make of it.
+        # The multipliers of slopes need no scaling: they relate V e and its products with the slopes, in equal units.
         return Witness([P], [G], differential=nd, slopes=witness.slopes)
 
 
 def _errors_of_kalman(
     A: FloatArray, C: FloatArray, B: FloatArray, D: FloatArray, differential: int, sizes: FloatArray
 ) -> FloatArray:
-    """Return what the errors of a Kalman filter of the mean corner are about: P is near a multiple of one in these."""
+    """Return the sizes of the errors of a Kalman filter for the mean of the corners.
+
+    In units of these sizes, P is near a multiple of the identity.
+    """
     k = differential
     if not D.any() or not B.any():
         return sizes
@@ -281,7 +287,7 @@ def _errors_of_kalman(
         below = np.linalg.solve(A[k:, k:], A[k:, :k]) if k < len(A) else np.zeros((0, k))
         a, c = A[:k, :k] - A[:k, k:] @ below, C[:, :k] - C[:, k:] @ below
         s = sizes[:k]
-        # A little of everything drives states that nothing else does.
+        # A little noise on all states, so that none is without noise.
         drive = B[:k] / s[:, None]
         least = LEAST_DRIVE * np.linalg.norm(drive) * np.eye(k)
         scaled = a * s / s[:, None]
@@ -293,7 +299,7 @@ def _errors_of_kalman(
 
 
 def _sizes(terms: NonlinearTerms, region: OperatingRegion) -> FloatArray:
-    """Return what each state and fault is about: the width of its range, or of those that it has a part in."""
+    """Return the size of each state and fault: the width of its range, or of ranges of sums that contain it."""
     sizes = np.zeros(len(terms.names))
     for each in region.ranges:
         for name, factor in each.combination.parts:
@@ -318,13 +324,13 @@ def _proved(
     bounds: FloatArray,
     drive: tuple[FloatArray, FloatArray, FloatArray],
     solution: _Solution,
-    asked: RegionObserverMethod,
+    options: RegionObserverMethod,
     problem: _Scaled,
     progress: Callable[[str], None],
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
-    """Return what the shipped numbers prove: the decay and the level, each with Lyapunov matrices of its own."""
+    """Return the decay and the level that are proved for the shipped numbers, each with its Lyapunov matrices."""
     vertices = corner_errors(terms, slopes, bounds, solution.gain, drive)
-    wanted = asked.decay or 0.0
+    wanted = options.decay or 0.0
     witness = problem.decay_of(solution.gain, progress) or solution.of_decay
     rate = fastest_decay(vertices, witness, _fastest(vertices, witness))
     if rate < wanted and prove_decay(vertices, solution.of_decay, wanted, discrete=False).proved:
@@ -339,7 +345,7 @@ def _proved(
     if solution.level is None:
         return claims, matrices
     matrices |= stored_witness(solution.witness, GAIN_WITNESSES)
-    prover, name = (prove_mean_square, "region_deviation") if asked.goal == "power" else (prove_gain, "region_gain")
+    prover, name = (prove_mean_square, "region_deviation") if options.goal == "power" else (prove_gain, "region_gain")
     for room in PROOF_ROOMS:
         level = solution.level * (1.0 + room)
         if prover(vertices, solution.witness, level, discrete=False).proved:
@@ -351,7 +357,7 @@ def _proved(
 
 
 def _fastest(vertices: Proved, witness: Witness) -> float:
-    """Return a rate above any that could be proved: what the certificate allows at one corner, or in the middle."""
+    """Return an upper bound of the provable rates: that of the certificate at one corner, or in the middle."""
     vertex = vertices.nominal if isinstance(vertices, SlopeBlock) else vertices[0]
     P, G = witness.P[0], witness.P[0] if witness.G is None else witness.G[0]
     GM = G.T @ vertex(Ball)[0].midpoint
@@ -359,7 +365,7 @@ def _fastest(vertices: Proved, witness: Witness) -> float:
     return 0.0 if rate is None else FASTEST_ROOM * rate
 
 
-def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObserverMethod) -> list[str]:
+def _notes(region: OperatingRegion, observer: RegionObserver, options: RegionObserverMethod) -> list[str]:
     measured = {place for place, _, _ in region.measured()}
     states, _, _ = region.matrices()
     assumed = [
@@ -390,15 +396,21 @@ def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObser
 
 
 def _noise_notes(
-    terms: NonlinearTerms, slopes: tuple[Slope, ...], bounds: FloatArray, gain: FloatArray, asked: RegionObserverMethod
+    terms: NonlinearTerms,
+    slopes: tuple[Slope, ...],
+    bounds: FloatArray,
+    gain: FloatArray,
+    options: RegionObserverMethod,
 ) -> list[str]:
-    """Return what noise does to a design for the fastest decay, which weighs none: a step of it from rest, where the
-    slopes are in the middle of their bounds."""
-    if asked.goal != "decay" or asked.gains is not None or not gain.size:
+    """Return a note on the effect of noise on a design for the fastest decay, which does not take noise into account.
+
+    The effect is that of one sample from rest, with the slopes in the middle of their bounds.
+    """
+    if options.goal != "decay" or options.gains is not None or not gain.size:
         return []
     W, Wy, V = directions(terms, slopes)
     middle, _ = middle_and_half(bounds)
-    nd, step = terms.differential, asked.sample_time or 0.0
+    nd, step = terms.differential, options.sample_time or 0.0
     corrected = whole_gain(terms, gain)
     A = terms.A + W @ np.diag(middle) @ V - corrected @ (terms.C + Wy @ np.diag(middle) @ V)
     moved = np.diag(np.arange(len(A)) < nd) - step * A

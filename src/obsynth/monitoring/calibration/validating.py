@@ -1,4 +1,4 @@
-"""Comparing a recorded, fault-free log with a design: its innovations, the variances that the log contradicts."""
+"""Validation of a design by a log without faults: tests of its innovations, and variances that the log contradicts."""
 
 from __future__ import annotations
 
@@ -56,43 +56,44 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign
 
-#: Nats that a variance of the design must cost, the others being free, before its ratio is reported.
+#: A variance is reported if the log likelihood with the design's value is lower by so many nats than with the likeliest
+#: one, the other variances being at their likeliest values.
 CLEAR_NATS = 3.0
 
-#: Where something else explains coloured innovations, variances are reported if they explain so many times
-#: as many nats: process noise and coloured sensor noise are hardly distinguished on one log.
+#: If another cause explains coloured innovations, variances are reported only if they raise the log likelihood by so
+#: many times as much: one log hardly distinguishes process noise from coloured sensor noise.
 CLEARLY_MORE = 1.25
 
-#: Ratios nearer to one than this factor are not reported: nobody knows a variance better.
+#: Ratios of variances within this factor of one are not reported, since variances are not known more accurately.
 REPORTED_SPREAD_RATIO = 1.5
 
-#: A factor this near a whole number, of that, is written as its word: it is an estimate itself.
+#: A factor that differs from a whole number by less than this share is printed as a word, since it is an estimate.
 WORD_SHARE = 0.25
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is reported.
 OFFSET = 3.0
 
-#: Rows that a log must have at least.
+#: Least number of rows of a log.
 LEAST_VALIDATED_ROWS = 20
 
-#: A sensor's variance that a log may say, at least, as a share of what the design says.
+#: Lower bound of the likeliest variance of a sensor, as a share of that in the design.
 LEAST_RATIO = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedInnovations:
-    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``."""
+    """The innovations of a run over a log, with its estimates."""
 
-    innovations: FloatArray
-    deviations: FloatArray
-    squares: float
-    degrees: int
-    estimates: Mapping[str, FloatArray]
+    innovations: FloatArray  # ``(n, ny)``
+    deviations: FloatArray  # ``(n, ny)``: their standard deviations
+    squares: float  # sum of the NIS
+    degrees: int  # sum of its degrees of freedom
+    estimates: Mapping[str, FloatArray]  # ``(n, 2)``: each parameter with its deviation
     states: FloatArray  # ``(n, nx)``
 
     @property
     def standardised(self) -> FloatArray:
-        """Innovations in their own deviations ``(n, ny)``, NaN where nothing was measured."""
+        """Innovations in units of their deviations ``(n, ny)``, NaN where nothing was measured."""
         return np.asarray(self.innovations / self.deviations)
 
     @property
@@ -103,10 +104,10 @@ class RecordedInnovations:
 
 
 def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedInnovations:
-    """Run a design over a log."""
+    """Return the innovations of a design over a log."""
     observer = design.observer
     if isinstance(observer, (DAEObserver, RecursiveObserver)) and observer.sensors is not None:
-        # Afterwards every value is known at its own time.
+        # In a recorded log, late samples are known at the times that they belong to.
         log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
         estimates = _over(changed(observer, sensors=None), log)
@@ -119,10 +120,11 @@ def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedIn
 
 
 def _integration_error(observer: object, log: RecordedLog, record: RecordedInnovations) -> IntegrationError | None:
-    """Return the error of backward Euler along a log, where an observer takes such steps."""
+    """Return the error of backward Euler along a log; ``None`` for observers without such steps."""
     if not (isinstance(observer, DAEObserver) and observer.integration == "backward-euler"):
         return None
-    # Where the noise of a sensor is coloured, R is what is white beside it, next to nothing.
+    # In units of the innovations' deviations: R would be too small for sensors with coloured noise, since it is only
+    # the white part.
     return integration_error(
         observer.model,
         record.states,
@@ -134,7 +136,7 @@ def _integration_error(observer: object, log: RecordedLog, record: RecordedInnov
 
 
 def _over(observer: DAEObserver, log: RecordedLog) -> Estimates:
-    """Return the estimates over a log; inputs that are missing are those that runs take in their place."""
+    """Return the estimates over a log; missing inputs are replaced as in a run."""
     u = log.measured_inputs
     if not np.isnan(u).any():
         return observer.run(log.y, u, progress=False)
@@ -146,7 +148,8 @@ def _over(observer: DAEObserver, log: RecordedLog) -> Estimates:
 
 
 def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str, float]) -> RecordedInnovations:
-    """Predict each sample from those before it: a step without measurements, beside the one with them."""
+    """Return the innovations of a recursive observer: at each sample a step without measurements gives the prediction,
+    and a step with them the next state."""
     plant = observer.plant
     y, u = _deviating(observer, log, point)
     state, nothing = observer.init(), np.full(plant.ny, np.nan)
@@ -164,7 +167,7 @@ def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str
 def _deviating(
     observer: RecursiveObserver, log: RecordedLog, point: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return outputs and inputs of a log as they deviate from the operating point."""
+    """Return the deviations of outputs and inputs of a log from the operating point."""
     y = log.y - np.array([point.get(name, 0.0) for name in observer.plant.output_names])
     u = log.measured_inputs - np.array([point.get(name, 0.0) for name in observer.plant.input_names])
     return y, u
@@ -183,28 +186,34 @@ def _recorded(run: Estimates, innovations: FloatArray, deviations: FloatArray) -
 
 
 def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, float], float, FloatArray]:
-    """Return what a log says of the variances of a design, parameters at their start, or as they walk: likeliest over
-    designed variance for each that it contradicts, the nats that the likeliest ones gain, and the walk of the
-    parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
+    """Return the likeliest variances on a log, with the parameters constant or as random walks.
+
+    Returns
+    -------
+    tuple
+        The ratio of the likeliest to the designed variance for each variance that the log contradicts; the increase of
+        the log likelihood, in nats, by the likeliest variances; and the likeliest covariance of the parameters' random
+        walk ``(nq, nq)``, at most the stated one.
+    """
     model = observer.model
     held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
     walk = observer.random_walk if stated_walk(observer).any() else np.zeros((model.nq, model.nq))
     walking = np.diag(walk) > 0.0
     if walking.any() and not held.is_data:
-        # Equations given as functions take no further states.
+        # A model whose equations are functions cannot be extended by states.
         return {}, 0.0, walk
     designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
     noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
     walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
     problem = _variance_problem(observer, log, held, noisy, walks)
-    # What is added to the equation of a state that walks acts during the whole step.
+    # Noise in the equation of a walking state acts during the whole step, hence the division by the squared step.
     designed = np.concatenate([designed_Q[designed_Q > 0.0], np.diag(walk)[walking] / log.dt**2, designed_R])
     fit = Fit(np.zeros(0), problem.x0, np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
     objective = Objective(problem, fit)
     try:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
-        # Without a likelihood nothing can be reported of its variances.
+        # The likelihood cannot be computed: nothing is reported.
         return {}, 0.0, walk
     q, r = variance_names(model.equation_names, model.output_names)
     keys = dict(zip(model.equation_names, q, strict=True))
@@ -225,8 +234,11 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
 def _variance_problem(
     observer: DAEObserver, log: RecordedLog, held: DAEModel, noisy: tuple[str, ...], walks: Mapping[str, float]
 ) -> CalibrationProblem:
-    """Return the problem of fitting nothing but the variances of a design: of its noisy equations, the parameters that
-    walk, and the sensors; ``held`` is its model with the parameters at their start."""
+    """Return the problem of fitting the variances of a design alone.
+
+    These are the variances of its noisy equations, of the walking parameters and of the sensors.  ``held`` is its model
+    with the parameters at their start.
+    """
     model, nothing = held, np.zeros(0)
     walking = [name in walks for name in model.parameter_names]
     extended: Any = with_noise(held, walks=walks)[0] if walks else held
@@ -257,7 +269,7 @@ def _variance_problem(
 
 
 def _contradicted_ratio(objective: Objective, best: Maximum, i: int, variance: float) -> float | None:
-    """Return the likeliest over a designed variance where the log contradicts that clearly, else `None`."""
+    """Return the ratio of a likeliest to a designed variance if the log clearly contradicts the latter, else `None`."""
     ratio = float(np.exp(best.z[i]) / variance)
     if max(ratio, 1.0 / ratio) <= REPORTED_SPREAD_RATIO:
         return None
@@ -281,17 +293,17 @@ def validate(
     Parameters
     ----------
     design : ObserverDesign
-        Recursive or nonlinear: one that predicts its outputs with a covariance.  Of a linear design it is the plant
-        that is compared, by the Kalman filter with the noise that it states: without faults, from any start, and with
-        unknown disturbances that may be anything.
+        A recursive or nonlinear design, which predicts its outputs with a covariance.  For a linear design, the plant
+        is compared with the log by the Kalman filter for the plant's stated noise, without faults, from any initial
+        state, and with arbitrary unknown disturbances.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, inputs and outputs.
     rows : str, slice or pair, optional
-        ``"a:b"``, as Python counts: the rows without faults; all by default.
+        The rows without faults, such as ``"a:b"``, counted as in Python; all by default.
     columns : mapping of str to str, optional
         Column of a signal, or of ``time``, where the names differ.
     scales : mapping of str to float, optional
-        What a column is multiplied by; those of the plant by default.
+        Factor of each column; those of the plant by default.
     progress : callable, optional
         Called with a text at each stage.
 
@@ -299,7 +311,7 @@ def validate(
     -------
     Validation
         NIS per degree of freedom, mean and whiteness of each sensor's innovations, variances that the log contradicts,
-        and a verdict with what to change: a signal that is likely in another unit, too.
+        and a verdict with what to change, including signals that are likely in another unit.
 
     Raises
     ------
@@ -348,7 +360,7 @@ def validate(
         sentences.append(_explained(explained, linear=linear))
     if linear:
         sentences += sentences_on_sizes(sensors, total, explained or ())
-    # In another unit nothing else that innovations say has a meaning.
+    # If a signal is in another unit, other statements on the innovations have no meaning.
     sentences = sentences_on_units(design, record_log) or sentences
     passed = total.holds and not sentences
     if not (passed or total.holds or ratios) and explained is None:
@@ -389,7 +401,7 @@ def _usable_log(
     columns: Mapping[str, str] | None,
     scales: Mapping[str, float] | None,
 ) -> RecordedLog:
-    """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
+    """Return the log without clearly wrong samples; raise `SpecError` if the design or the log cannot be used."""
     if not (states_innovations(design) or is_linear(design)):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual with which a log could be compared: "
@@ -420,8 +432,8 @@ def _usable_log(
 def _of_linear_plant(
     design: ObserverDesign, log: RecordedLog
 ) -> tuple[ObserverDesign, RecordedLog, RecordedInnovations | None]:
-    """Return the Kalman filter of the plant of a linear design, the log without samples that it excludes, and its run
-    over the log where it excludes none."""
+    """Return the Kalman filter for the plant of a linear design, the log without the samples that it excludes, and the
+    innovations of its run if it excludes none."""
     made = filter_of_linear_plant(design, log, lambda tried: _states(tried, log))
     run = recorded_innovations(made, log)
     wrong = standing_out(run.standardised)
@@ -434,7 +446,7 @@ def _states(design: ObserverDesign, log: RecordedLog) -> FloatArray:
     if not isinstance(observer, RecursiveObserver):
         raise TypeError(f"{type(observer).__name__} is no recursion")
     state, rows = observer.init(), []
-    # Inputs may be missing, which `run` does not take.
+    # Step by step, since `run` does not accept missing inputs.
     for y_k, u_k in zip(*_deviating(observer, log, _operating_point(design)), strict=True):
         state, row = observer.advance(state, y_k, u_k)
         rows.append(row)
@@ -449,16 +461,18 @@ def _contradicted(
     total: Consistency,
     note: Callable[[str], object],
 ) -> tuple[Mapping[str, float], tuple[Explanation, ...] | None]:
-    """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
-    where they are white, as the design states its variances or with the likeliest ones."""
+    """Return the variances that a log contradicts, and the possible causes of innovations that stay coloured.
+
+    The causes are ``None`` if the innovations are white, with the variances of the design or with the likeliest ones.
+    """
     white, observer = _white(sensors), design.observer
-    # A variance that moves no innovation out of what is expected is no reason to change a design.
+    # If the innovations are as expected, no variance is reported.
     if total.holds and white and all(item.nis.holds for item in sensors.values()):
         return {}, None
     likeliest_noise = None
     if isinstance(observer, DAEObserver):
         note("variances that the log makes likeliest")
-        # What a gate leaves out is no sample of the stated noise.
+        # Samples that the observer excludes as outliers are not used to estimate the noise.
         passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
         likeliest_noise = noise_ratios(observer, passed_by_gate)
     ratios: Mapping[str, float] = {} if likeliest_noise is None else likeliest_noise[0]
@@ -467,7 +481,8 @@ def _contradicted(
     other_causes = _explanations(design, log, record, note)
     if likeliest_noise is None or not ratios or not isinstance(observer, DAEObserver):
         return ratios, other_causes
-    # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
+    # Wrong variances make innovations coloured as well.  They are reported if the innovations with the likeliest
+    # variances are white, and if no other cause explains clearly more.
     _, gain, walk = likeliest_noise
     likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, ratios, walk)), log)
     rival = CLEARLY_MORE * other_causes[0][1] if other_causes else 0.0
@@ -479,8 +494,10 @@ def _contradicted(
 def _as_far_as_it_walks(
     design: ObserverDesign, log: RecordedLog, record: RecordedInnovations, note: Callable[[str], object]
 ) -> tuple[ObserverDesign, RecordedInnovations, list[str]]:
-    """Return the design with as much of the walk of its parameters as the log shows, its run, and what is said of
-    that; ``record`` is the run with all of it."""
+    """Return the design with the likeliest part of its parameters' random walks, its innovations, and sentences on it.
+
+    ``record`` has the innovations with the whole stated walks.
+    """
     observer = design.observer
     walk = stated_walk(observer)
     if not walk.any() or not isinstance(observer, (DAEObserver, RecursiveObserver)):
@@ -554,7 +571,7 @@ def _sentences(
 
 
 def _spectrum(sensor: SensorValidation, dt: float) -> str:
-    """Return at which periods the power of innovations is largest, in words; empty where a log is too short for it."""
+    """Return a text on the periods with the largest power of the innovations; empty if the log is too short."""
     rows, multiple = sensor.power
     return f", {multiple:.2g} times their mean power at periods of about {rows * dt:.2g} s" if rows else ""
 
@@ -564,7 +581,7 @@ def _white(sensors: Mapping[str, SensorValidation]) -> bool:
 
 
 def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: FloatArray) -> DAEObserver:
-    """Return the observer with the likeliest variances on a log, where these are told."""
+    """Return the observer with its variances multiplied by the reported ratios, and with another random walk."""
     names = variance_names(observer.model.equation_names, observer.model.output_names)
     q, r = ([ratios.get(name, 1.0) for name in part] for part in names)
     Q, R = np.diag(np.diag(observer.Q) * q), np.diag(np.diag(observer.R) * r)
@@ -574,7 +591,7 @@ def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: Fl
 def _explanations(
     design: ObserverDesign, log: RecordedLog, record: RecordedInnovations, note: Callable[[str], object]
 ) -> tuple[Explanation, ...]:
-    """Return what explains innovations that are not white, other than the variances."""
+    """Return the possible causes of coloured innovations other than wrong variances."""
     observer, constants = design.observer, dict[str, float]()
     if isinstance(observer, DAEObserver):
         constants = {name: float(value) for name, value in observer.model.constants.items()}
@@ -622,8 +639,11 @@ def _explained(causes: Sequence[Explanation], *, linear: bool) -> str:
 def _far(
     estimates: Mapping[str, FloatArray], design: ObserverDesign, samples: int
 ) -> tuple[dict[str, float], list[str]]:
-    """Return by how many deviations each parameter's estimate ends off its start, where that is further than it walks;
-    and a sentence for each that walks so far."""
+    """Return the parameters whose estimates end too far from their start, and notes on others.
+
+    The distances are in standard deviations.  The notes are on estimates that end far from their start, but not further
+    than the parameter may walk.
+    """
     observer, walk = design.observer, stated_walk(design.observer)
     start = dict(zip(observer.fault_names, getattr(observer, "initial_parameters", ()), strict=False))
     variances = np.diag(walk) if walk.size else np.zeros(len(start))
