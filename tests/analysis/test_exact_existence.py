@@ -181,3 +181,16 @@ def test_a_fault_of_which_rounding_is_left_is_unclear(method, dt, eliminated, co
     # In floating point the sum that was taken for zero is a fault that acts nowhere.
     tried = [row for row in method_class(method).of({}).existence(plant, exactly=False) if not row.holds]
     assert not [row for row in tried if row.unclear]
+
+
+def test_two_faults_that_cancel_are_called_a_combination():
+    """It said "the fault 'leak', 'pump wear' is output-nulling", though each alone is visible."""
+    tanks = DescriptorSystem(
+        E=[[0.5, 0, 0], [0, 0.5, 0], [0, 0, 4]],
+        A=[[-0.005, 0, 1], [0.005, -0.005, 0], [0, 0, -1]],
+        C=[[1, 0, 0], [0, 1, 0]],
+        Bf=[[-1, 0], [0, 0], [0, -1]],
+        fault_names=["leak", "pump wear"],
+    )
+    report = check(discretise(tanks, 5.0).plant)["fault-estimation-filter"]
+    assert "a combination of the faults 'leak', 'pump wear' is output-nulling" in report["exists: fault zeros"].detail

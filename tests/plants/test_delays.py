@@ -461,3 +461,13 @@ def test_check_takes_a_spec_whose_transformation_samples_the_delays(tmp_path, ca
     assert main(["check", "--system", str(spec), "--json"]) == 0
     structure = json.loads(capsys.readouterr().out)["structure"]
     assert set(structure) == {"as_written_without_delays", "as_the_method_sees_it"}
+
+
+def test_tolerances_are_lost_with_delays_by_that_name():
+    """It said 'E, A, B, C, Bf, Bd were changed', of which the user had changed nothing."""
+    plant = obsynth.uncertain_system(
+        {"A": [["-a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "delays": {"u1": 3.0}},
+        {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    )
+    for delayed in (obsynth.discretise(plant, 1.0), obsynth.absorb_delays(plant, order=2)):
+        assert delayed.plant.uncertainty.lost == "delays became states"

@@ -170,7 +170,19 @@ def test_tolerances_do_not_follow_a_reduced_index():
     )
     found = obsynth.eliminate_algebraic_states(plant).plant
     assert found.uncertainty.lost == "its index was reduced"
-    assert any("not carried over" in note for note in obsynth.ui_pi_observer(plant).notes)
+    note = next(note for note in obsynth.ui_pi_observer(plant).notes if "not carried over" in note)
+    # It advised an elimination, which reduces the index in the same way.
+    assert "Eliminate" not in note
+
+
+def test_constants_without_tolerances_lose_none_with_the_index():
+    """Named constants without tolerances gave the note 'The tolerances of the constants () are not carried over'."""
+    given = bar("position")
+    rows = given.A.tolist()
+    rows[2][0] = "-k"
+    plant = obsynth.uncertain_system({"E": given.E, "A": rows, "C": given.C, "Bf": given.Bf}, {"k": 2.0})
+    assert obsynth.eliminate_algebraic_states(plant).plant.uncertainty is None
+    assert not any("not carried over" in note for note in obsynth.ui_pi_observer(plant).notes)
 
 
 def bar(level, **more):

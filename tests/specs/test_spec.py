@@ -418,3 +418,14 @@ def test_times_of_profiles_may_have_a_unit(tmp_path):
     path.write_text(path.read_text().replace("10 min", "10 parsecs"), encoding="utf-8")
     with pytest.raises(SpecError, match="a time in us, ms, s, min or h"):
         load_spec(path)
+
+
+def test_a_name_with_a_space_is_answered_with_one_that_is_taken(tmp_path: Path) -> None:
+    """The message said which letters a name may have, and left the name to the reader."""
+    path = tmp_path / "spec.yaml"
+    path.write_text("schema_version: 1\nname: quarter car\nplant: {dt: 1, A: [[0.5]], C: [[1]], Bf: [[1]]}\n")
+    with pytest.raises(SpecError, match="'quarter-car', for example; description takes any text") as failure:
+        load_spec(path)
+    path.write_text(path.read_text().replace("quarter car", "quarter-car"))
+    assert load_spec(path).name == "quarter-car"
+    assert "quarter car" in str(failure.value)

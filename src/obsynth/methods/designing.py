@@ -48,6 +48,10 @@ SAME_PLANT = 1e-9
 
 #: A larger steady_error_limit is suggested up to this share of a constant fault that estimates may miss.
 LARGEST_STEADY_ERROR = 0.1
+_CHANGED_BY_METHOD = "the method changed the plant by itself"
+_ELIMINATE_FIRST = (
+    " Eliminate algebraic states first (transform: eliminate_algebraic_states, obsynth.eliminate_algebraic_states)."
+)
 
 
 @arguments_checked
@@ -483,8 +487,7 @@ def verified(
             *notes,
             f"The tolerances of the constants ({', '.join(uncertain.box.names)}) are not carried over: "
             f"{uncertain.lost}. The design is for the nominal plant, and thresholds and proofs over the box are "
-            "refused. Eliminate algebraic states first (transform: eliminate_algebraic_states, "
-            "obsynth.eliminate_algebraic_states).",
+            f"refused.{_ELIMINATE_FIRST if uncertain.lost == _CHANGED_BY_METHOD else ''}",
         )
     return draft.replace(report=report, notes=(*draft.notes, *notes))
 
@@ -598,7 +601,7 @@ def _with_tolerances_of(original: Plant, shipped: Any) -> Any:
             same = original
         if same.state_names == shipped.state_names and same.dt == shipped.dt and agree(same, shipped):
             return shipped.replace(uncertainty=same.uncertainty)
-    return shipped.replace(uncertainty=uncertain.left_behind("the method changed the plant by itself"))
+    return shipped.replace(uncertainty=uncertain.left_behind(_CHANGED_BY_METHOD))
 
 
 def agree(first: DescriptorSystem, second: DescriptorSystem) -> bool:

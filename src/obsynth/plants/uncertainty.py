@@ -112,15 +112,16 @@ class Uncertainty:
         """What statements about the box leave out: empty for a plant that is linear."""
         return "" if self.shift is None else "what is not linear in the plant is not covered: this is its linear model"
 
-    def left_behind(self, why: str) -> Uncertainty:
-        """Return what is uncertain in a plant that was changed in a way that constants and entries do not tell.
+    def left_behind(self, why: str) -> Uncertainty | None:
+        """Return what is uncertain in a plant that was changed in a way that constants and entries do not tell:
+        `None` where no constant has a tolerance, as the plant is still an exact model.
 
         Parameters
         ----------
         why : str
             What was done.
         """
-        return replace(self, lost=self.lost or why)
+        return replace(self, lost=self.lost or why) if self.box.names else None
 
     def with_box(self, box: ConstantsBox) -> Uncertainty:
         """Return the same entries with other tolerances.

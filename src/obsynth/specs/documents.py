@@ -393,7 +393,11 @@ def _explained(
     elif kind == "time":
         text = f"{item['msg']}, not {described(value)}.{instead_of_time(value)}"
     elif kind == "string_pattern_mismatch":
-        text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
+        possible = re.sub("[^A-Za-z0-9._-]+", "-", value).strip("-._")[:100]
+        text = (
+            f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}"
+            f"{f': {possible!r}, for example; description takes any text' if possible else ''}."
+        )
     else:
         expected = (
             "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted_in_words(kind, context)

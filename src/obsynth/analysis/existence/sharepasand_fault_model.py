@@ -116,7 +116,8 @@ def _model_condition(
         hides = decide_rank(without, expected=plant.nx + width, equilibrated=False)
         disturbances = leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if hides.full else ()
         signals = (*faults, *disturbances)
-        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        many = "s" if len(disturbances) > 1 else ""
+        masked = f" is masked by the unknown input{many} {', '.join(map(repr, disturbances))}" if disturbances else ""
         alone = len(faults) == 1
         who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
         hidden = (
@@ -126,7 +127,7 @@ def _model_condition(
         )
         detail += (
             f": at {where} {who}{masked or ' is output-nulling'}: {hidden} estimate {'it' if alone else 'them'}. "
-            "Measure another signal, or leave one of them out."
+            f"Measure another signal, or leave {'it' if alone else 'one of them'} out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",

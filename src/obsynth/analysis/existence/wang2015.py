@@ -336,15 +336,18 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
     value = pole_text(zero.value, 6)
     if zero.is_unobservable_mode:
         signals = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
+        states = f"state{'' if len(signals) == 1 else 's'} {', '.join(map(repr, signals))}"
         detail = (
-            f"the mode z = {value} (states {', '.join(map(repr, signals))}) is undetectable: no output responds to "
+            f"the mode z = {value} ({states}) is undetectable: no output responds to "
             "it, and it does not decay. Measure something that it moves."
         )
     else:
         signals = leading_names(np.abs(zero.input_direction), plant.fault_names, most=MOST_NAMES)
+        alone, named = len(signals) == 1, ", ".join(map(repr, signals))
         detail = (
-            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} is output-nulling along z^k: it has "
-            "no effect on the outputs, so no filter can estimate it. Measure another signal."
+            f"at the zero z = {value} {'the fault' if alone else 'a combination of the faults'} {named} is "
+            "output-nulling along z^k: it has no effect on the outputs, so no filter can estimate "
+            f"{'it' if alone else 'them'}. Measure another signal."
         )
     return _fault_zeros(holds=False, value=abs(zero.value), detail=detail, mode=zero.value, signals=signals)
 

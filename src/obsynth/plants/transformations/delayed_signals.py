@@ -258,8 +258,8 @@ def _with_chains(
     labels, names = _labels(source, lags)
     made = with_states(source, names, E=None, Bw=Bw, Dw=Dw, noise_names=noise_names, dt=step, delays=None, **changes)
     made = made.replace(**{key: {**getattr(made, key), **value} for key, value in labels.items()})
-    if made.uncertainty is not None:
-        made = made.replace(uncertainty=made.uncertainty.left_behind("delays became states"))
+    if source.uncertainty is not None:
+        made = made.replace(uncertainty=source.uncertainty.left_behind("delays became states"))
     placed = _inputs_placed(np.eye(source.nu), lags)
     from_state = np.hstack([np.zeros((source.nu, nx)), placed @ past, np.zeros((source.nu, read))])
     return DelayedSamples(source, made, from_state, placed @ present, noise_kept)

@@ -228,8 +228,8 @@ def _approximated(plant: DescriptorSystem, order: int) -> Transformation:
         changes[direct] = np.where(at_once, outer, d_y @ outer)
     names = (*plant.state_names, *_state_names(plant, order))
     made = with_states(plant, names, delays=None, **changes)
-    if made.uncertainty is not None:
-        made = made.replace(uncertainty=made.uncertainty.left_behind("delays became states"))
+    if plant.uncertainty is not None:
+        made = made.replace(uncertainty=plant.uncertainty.left_behind("delays became states"))
     recovery = unchanged_states(plant, made, from_state=np.eye(n, n + p + q))
     good = good_up_to(order) / max(plant.delays.values())
     note = (

@@ -11,6 +11,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import index_of, leading_names
 from obsynth.plants.transformations.recovery import Transformation, unchanged_states, with_states
@@ -47,7 +48,7 @@ def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transforma
     return Transformation(plant, new, description, unchanged_states(plant, new, from_state=np.eye(nx, nx + count)))
 
 
-def _augmented(uncertain: Uncertainty, nx: int, chosen: Sequence[int]) -> Uncertainty:
+def _augmented(uncertain: Uncertainty, nx: int, chosen: Sequence[int]) -> Uncertainty | None:
     """Return what is uncertain in a plant whose ``chosen`` faults have become states: entries of Df are then of C."""
     if uncertain.written is not None:
         return uncertain.left_behind("faults were appended as states after the plant was transformed")
@@ -67,11 +68,11 @@ def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Seque
     if np.max(shares[plant.nx :]) > NEGLIGIBLE_INPUT:
         signals = leading_names(shares[plant.nx :], faults)
         culprit = (
-            f"Faults {', '.join(signals)} have the same effect on the outputs as algebraic states, or as each other."
+            f"Faults {quoted_names(signals)} have the same effect on the outputs as algebraic states, or as each other."
         )
     else:
         signals = leading_names(shares[: plant.nx], plant.state_names)
-        culprit = f"States {', '.join(signals)} are neither dynamic nor measured."
+        culprit = f"States {quoted_names(signals)} are neither dynamic nor measured."
     raise PreconditionError(
         f"Faults cannot be appended as states: {decision.describe()}. {culprit} Leave faults out, or add an output.",
         condition="rank [E 0; 0 0; C Df]",

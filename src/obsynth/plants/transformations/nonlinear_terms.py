@@ -21,7 +21,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
-from obsynth.numerics.suggestions import there_are
+from obsynth.numerics.suggestions import quoted_names, there_are
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_equations import equation_of
 from obsynth.plants.scheduling import TEXTS_OF_OPERATIONS
@@ -405,8 +405,8 @@ def _solved_for_rates(
         able = [i for i, (row, _, _) in enumerate(waiting) if row[column]]
         if not able:
             raise PreconditionError(
-                f"The derivatives of {', '.join(moving)} are dependent: the one of {state!r} follows from the others "
-                "(index 2 or more, or a redundant state). Leave the state out, or differentiate its constraint.",
+                f"The derivatives of {quoted_names(moving)} are dependent: the one of {state!r} follows from the "
+                "others (index 2 or more, or a redundant state). Leave the state out, or differentiate its constraint.",
                 condition="index",
                 signals=(state,),
             )

@@ -16,6 +16,7 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delayed_signals import sampled_with_delays
@@ -109,7 +110,7 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
     signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
     if signals:
         raise PreconditionError(
-            f"Process noise {', '.join(signals)} reaches an output directly, where continuous white noise has "
+            f"Process noise {quoted_names(signals)} reaches an output directly, where continuous white noise has "
             "infinite variance: give measurement noise in Dw only, or filter the process noise by a state.",
             condition="noise without a direct path",
             signals=signals,
