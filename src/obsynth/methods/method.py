@@ -38,15 +38,16 @@ if TYPE_CHECKING:
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear", "polytopic"]
 
-#: What the choice by default (`auto`) takes a method for.
+#: The purposes for which the automatic choice (`auto`) considers a method.
 Purpose: TypeAlias = Literal[
     "faults", "faults under the weakest conditions", "state despite unknown inputs", "state despite noise", "parameters"
 ]
 
-#: Gains from fast errors of a measurement to a fault estimate above this are worth a note.
+#: A note is given if the gain from high-frequency measurement errors to a fault estimate is above this.
 WARN_AMPLIFICATION = 50.0
 
-#: Options by the names that other libraries have for them; the first that a method has is meant.
+#: Names of options in other libraries, with the corresponding options here; the first one that a method has is
+#: suggested.
 _OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("P0", "P", "initial_deviation"), ("initial_covariance",)),
     **dict.fromkeys(("x0", "z0"), ("initial_state",)),
@@ -60,17 +61,15 @@ _OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class ClaimMeaning:
-    """A number that a method may claim, and the ``row`` that checks it.
+    """A number that a method may claim, and the ``row`` of the verification report that checks it.
 
-    Where no row can, ``row`` is `obsynth.verification.claims.STATED_BY_SEARCH`.
+    If no row can check it, ``row`` is `obsynth.verification.claims.STATED_BY_SEARCH`.
     """
 
     unit: str  # empty: dimensionless
     meaning: str
     row: str = ""
-    side: Literal["", "at most", "at least"] = (
-        ""  # from which it bounds what it is said of; printed numbers are rounded so
-    )
+    side: Literal["", "at most", "at least"] = ""  # whether it is an upper or a lower bound; it is rounded accordingly
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +82,13 @@ class Synthesis:
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    transformation: Transformation | None = None  # before the design, which is then for its plant, with the way back
-    # As the recursive methods see it, where given another kind; or with the noise that the design is for.
+    transformation: Transformation | None = None  # of the plant before the design, with the map back to its states
+    # The plant that the design is for, if it is of another kind than the given one, or has other noise.
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None
 
     @property
     def linear_observer(self) -> LinearObserver:
-        """The observer of a linear method; raise `TypeError` where it is none."""
+        """The observer, which must be linear; raises `TypeError` otherwise."""
         if not isinstance(self.observer, LinearObserver):
             raise TypeError(f"{type(self.observer).__name__} is no LinearObserver")
         return self.observer
@@ -99,49 +98,49 @@ class Synthesis:
 class Method(ABC):
     """A method: a frozen dataclass whose fields are its options.
 
-    Annotations of the fields say what each option may be.  The docstring is that of the public function: what each
-    option means, what is returned and raised, and the source.  From both follow the public function
-    (`obsynth.methods.functions`), the spec's schema and the checks of the two.  What is heavy is imported where it is
-    used.
+    The annotations of the fields state the type and range of each option.  The docstring of the class is that of the
+    public function, with the meaning of each option, the result, the errors and the source.  The public function
+    (`obsynth.methods.functions`), the schema of specs and the checks of both follow from these.  Heavy modules are
+    imported where they are used.
     """
 
     #: Id of the method, in specs, gain sets and messages.
     id: ClassVar[str]
-    #: Kinds of plants that it takes.
+    #: Kinds of plants that the method accepts.
     plants: ClassVar[tuple[PlantKind, ...]]
-    #: Continuous, discrete or both, in words; ``continuous`` alone: its designs are sampled afterwards.
+    #: Continuous, discrete or both, as a text; if it is ``continuous`` alone, its designs are sampled afterwards.
     time: ClassVar[str]
-    #: What it estimates, in a few words.
+    #: What the method estimates, in a few words.
     summary: ClassVar[str]
-    #: The paper whose letters its gains have.
+    #: The paper whose notation the gains have.
     source: ClassVar[str]
-    #: Every number that it may claim.
+    #: All numbers that the method may claim.
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {}
-    #: Matrices that its certificate may hold.
+    #: Names of matrices that its certificate may contain.
     witnesses: ClassVar[frozenset[str]] = frozenset()
-    #: Its observers add constants to their outputs, which its own checks cover.
+    #: Whether its observers add constants to their outputs, which its own checks cover.
     adds_constants: ClassVar[bool] = False
-    #: What `auto` takes it for; nothing: only who names it gets it.
+    #: Purposes for which `auto` considers the method; without any, it is designed only by its name.
     purposes: ClassVar[frozenset[Purpose]] = frozenset()
-    #: Claims that say what was imposed and proved, not what was found.
+    #: Claims that the options impose and that are proved, in contrast to results of a search.
     imposed: ClassVar[frozenset[str]] = frozenset()
-    #: Whether an option ``mean`` puts registers behind the observer, which the checks are not about.
+    #: Whether an option ``mean`` adds averaging registers to the observer, which the checks leave out.
     averaged: ClassVar[bool] = False
-    #: Whether `synthesise` takes a ``scenario`` where constants of the plant have tolerances.
+    #: Whether `synthesise` accepts a ``scenario`` for plants whose constants have tolerances.
     over_scenario: ClassVar[bool] = False
-    #: Whether its designs are models without feedback: nothing is claimed of their stability, as the verdict says.
+    #: Whether its designs are models without feedback, of whose stability nothing is claimed.
     open_loop: ClassVar[bool] = False
-    #: What a design of it stores among its options beside these.
+    #: Further entries that its designs store among the options.
     recorded: ClassVar[frozenset[str]] = frozenset()
-    #: Which of the options decay, region and poles are about the eigenvalues of its linear observers.
+    #: Which of the options decay, region and poles refer to the eigenvalues of its linear observers.
     placed: ClassVar[frozenset[str]] = frozenset()
-    #: Values of required options, for questions that do not depend on them.
+    #: Values of required options, for existence conditions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
 
     def __post_init__(self) -> None:
         kinds = field_types(type(self))
         problems = [text for name, kind in kinds.items() if (text := problem_with(getattr(self, name), name, kind))]
-        # Rules across options presume that each of them is of its type.
+        # Rules that involve several options assume that each of them has its type.
         problems = problems or list(self.conflicts())
         if problems:
             raise SpecError(f"Options of {self.id}:", path=OPTIONS_PATH, problems=problems)
@@ -160,34 +159,34 @@ class Method(ABC):
         return cls(**{name: without_axes(value) for name, value in options.items()})
 
     def conflicts(self) -> Iterator[str]:
-        """Yield a sentence for each rule across options that is broken."""
+        """Yield a sentence for each violated rule that involves several options."""
         yield from ()
 
     @abstractmethod
     def existence(self, plant: Any, *, exactly: bool = True) -> tuple[Condition, ...]:
-        """Return the existence conditions of a plant, with these options, decided exactly or in floating point."""
+        """Return the existence conditions for a plant and these options, decided exactly or in floating point."""
 
     def require_stated(self, plant: Any) -> None:
-        """Raise an error where a design needs what neither the plant nor the options state."""
+        """Raise an error if a design needs data that neither the plant nor the options state."""
         return None
 
     def require_fitting(self, plant: Any) -> None:
-        """Raise `SpecError` where options name signals that a plant does not have, or are matrices of other sizes."""
+        """Raise `SpecError` if options name signals that the plant does not have, or are matrices of wrong sizes."""
         return None
 
     def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
-        """Whether options are about the states of a plant of index 2 or more as written: it is not reduced then."""
+        """Whether options refer to the original states of a plant of index 2 or more, so that it is not reduced."""
         return False
 
     def for_plant(self, plant: DescriptorSystem) -> Self:
-        """Return the method without what a plant of fewer faults makes void."""
+        """Return the method without options that have no meaning for a plant with fewer faults."""
         return self
 
     def synthesise(self, plant: Any, *, progress: Callable[[str], None]) -> Synthesis:
         """Return gains, observer and certificate, not yet verified.
 
-        By default what the function ``synthesise(plant, method, progress=)`` of the module ``synthesis`` in the
-        method's own package returns: heavy, and imported only here.
+        By default this calls ``synthesise(plant, method, progress=)`` of the module ``synthesis`` in the method's own
+        package, which is heavy and imported only here.
         """
         package = type(self).__module__.rpartition(".")[0]
         synthesis: Synthesis = import_module(f"{package}.synthesis").synthesise(plant, self, progress=progress)
@@ -195,14 +194,14 @@ class Method(ABC):
 
     @classmethod
     def from_gains(cls, plant: Any) -> Synthesis:
-        """Return realisation and certificate of gains that are given by name, in the letters of the paper."""
+        """Return realisation and certificate of given gains, by their names in the notation of the paper."""
         raise SpecError(f"Gains of {cls.id} are not read: design it instead.", path="method")
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped realisation alone.
 
-        By default what the function ``checks(design, printed_digits)`` of the module ``checks`` beside the class does.
+        By default this calls ``checks(design, printed_digits)`` of the module ``checks`` in the method's own package.
         """
         package = cls.__module__.rpartition(".")[0]
         rows: Iterator[Check] = import_module(f"{package}.checks").checks(design, printed_digits)
@@ -210,32 +209,32 @@ class Method(ABC):
 
     @classmethod
     def requested_limits(cls, design: ObserverDesign) -> Limits:
-        """Return, by option, which claims of a design it bounds: `verify` compares them."""
+        """Return, by option, the claims of a design that the option bounds; `verify` compares them."""
         return {}
 
     @classmethod
     def fixed_modes(cls, design: ObserverDesign) -> tuple[complex, ...]:
-        """Return the eigenvalues of a linear observer that no gain moves, which the option decay is not about."""
+        """Return the eigenvalues of a linear observer that no gain can move; the option decay excludes them."""
         return ()
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:
-        """Whether a linear design follows the plant's state; not one that relies on bounds of it."""
+        """Whether the errors of a linear design have an error model; not if it relies on bounds of the states."""
         return True
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
-        """Return what the shipped observer follows; ``None`` where it is no linear one, or its certificate lacks it.
+        """Return the error model of the shipped observer; ``None`` if it is not linear, or the certificate lacks it.
 
-        Every linear design that `has_error_model` needs one, and `verify` checks it.
+        Every linear design for which `has_error_model` is true needs one, and `verify` checks it.
         """
         return None
 
     @classmethod
     def constant_fault_gain(cls, design: ObserverDesign, model: ErrorModel) -> FloatArray:
-        """Return what the estimates ``(nf, nf)`` of constant faults are in the end; NaN columns say nothing.
+        """Return the steady-state estimates ``(nf, nf)`` of constant faults of size one; NaN columns if unknown.
 
-        By default the faults themselves, where the fault model that the observer holds has a constant."""
+        By default these are the faults themselves, if the fault model of the observer contains a constant."""
         return held_faults(model)
 
     def as_given(self) -> dict[str, Any]:
@@ -248,7 +247,7 @@ class Method(ABC):
 
 
 def _near(unknown: str, known: list[str]) -> str:
-    """Return the end of a message on an option that is not known: which one may be meant."""
+    """Return the end of a message on an unknown option: a similar one that may be meant."""
     ours = next((name for name in _OTHER_NAMES.get(unknown, ()) if name in known), None)
     return suggestion(unknown, known) if ours is None else f" Did you mean {ours!r}?"
 

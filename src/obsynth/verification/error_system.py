@@ -1,9 +1,9 @@
-r"""The error system of a shipped observer, from the plant and the realisation alone; what stored numbers add to it.
+r"""The error system of a shipped observer, from the plant and the realisation alone, with rounding of stored numbers.
 
-If ``Az V E + By C = V A``, ``Bu + By D = V B``, then ``e = V E x - z`` obeys ``e+ = Az e + (V b - By d) s`` for every
-fault, disturbance or noise s that enters by b and d, and an output with ``Cz V E + Dy C = K``, ``Du + Dy D = 0`` is
-``K x - Cz e + Dy d s`` (estimates that lag: past states appended).  Stored numbers miss a little: for any T, and T0
-with ``T0 E = 0``, ``eps = z - T E x`` obeys
+If ``Az V E + By C = V A`` and ``Bu + By D = V B``, then ``e = V E x - z`` obeys ``e+ = Az e + (V b - By d) s`` for
+every fault, disturbance or noise s with the input matrices b of the plant and d of the outputs.  An output with ``Cz V
+E + Dy C = K`` and ``Du + Dy D = 0`` is ``K x - Cz e + Dy d s``.  If estimates lag, past states are appended to x.
+Stored numbers satisfy these identities up to rounding: for any T, and T0 with ``T0 E = 0``, ``eps = z - T E x`` obeys
 
 .. math::
     \varepsilon^+ = A_z \varepsilon + K x + U u + \ldots, \qquad
@@ -12,7 +12,7 @@ with ``T0 E = 0``, ``eps = z - T E x`` obeys
     K = A_z T E + B_y C - T A, \quad U = B_u + B_y D - T B, \quad
     J = C_z T E + D_y C + T_0 A - G, \quad L = D_u + D_y D + T_0 B
 
-with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit`.
+where K, U, J, L, which are zero in exact arithmetic, are enclosed in balls; `errors_per_unit` bounds their effects.
 """
 
 from __future__ import annotations
@@ -41,20 +41,16 @@ from obsynth.results.checks import Check, upper_bound_check
 #: With more states of plant or observer the identities are evaluated in balls of double precision.
 MOST_EXACT_IDENTITIES = 300
 
-#: Digits, in bits, in which products of three stored numbers and their sums are all but exact.
+#: Precision in bits in which sums of products of three stored numbers are nearly exact.
 EXACT_BITS = 320
 
-#: How much wider a ball of double precision is than where another machine's may lie: both hold the same number.
-BOTH_BALLS = 3.0
-
-#: The identities of an error model hold to this share of their terms, whatever rounding of stored numbers does.
+#: Largest residual of the identities of an error model, relative to their terms.
 IDENTITY_SHARE = 1e-7
 
-#: Gains that were printed to some decimals leave less than this of them; that is judged by the rows of the method.
+#: The same for gains that were printed to some decimals; their effect is judged by the rows of the method.
 PRINTED_SHARE = 0.1
 
-#: Rows with terms below this share of the largest may be rounding of those: they are judged as if they were as
-#: large.
+#: Rows whose terms are below this share of the largest ones may be rounding of these; they count as rows of that size.
 LEAST_ROW = 1e-6
 
 Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -62,12 +58,12 @@ Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 @remembered
 def natural_scaling(plant: DescriptorSystem) -> Scaling:
-    """Return the scaling of a plant's equations, states and outputs that these suggest, without what drives them."""
+    """Return the scaling of a plant's equations, states and outputs that balances E, A and C."""
     return balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
 
 
 def with_past(plant: DescriptorSystem, lag: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return E, A, B, C of a plant whose state holds the last ``lag`` states too: ``[x(k); x(k-1); ...; x(k-lag)]``."""
+    """Return E, A, B, C of a plant with the last ``lag`` states appended: ``[x(k); x(k-1); ...; x(k-lag)]``."""
     if lag == 0:
         return plant.E, plant.A, plant.B, plant.C
     nx, total = plant.nx, plant.nx * (lag + 1)
@@ -80,31 +76,33 @@ def with_past(plant: DescriptorSystem, lag: int) -> tuple[FloatArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """What a linear observer follows, and from it its errors: monitors, tolerances and stored numbers use this one.
+    """The signals that a linear observer estimates, and its error system, for monitors, tolerances and stored numbers.
 
-    Its state z follows ``T E xa``, where xa is the plant's state, followed by its last ``lag`` states, or by the states
-    of a fault model ``w+ = Phi w`` (w' for dt = 0), ``f = Cw w``.  Without faults (that do not follow the model), noise
-    and disturbances its rows are ``goal xa``: the oldest state, ``Cw w``, and zero for residuals.
+    Its state z estimates ``T E xa``, where xa is the plant's state, followed by its last ``lag`` states, or by the
+    states of a fault model ``w+ = Phi w`` (w' for dt = 0), ``f = Cw w``.  Without noise, disturbances and faults that
+    do not obey the model, and after convergence, its outputs are ``goal xa``: the oldest state, ``Cw w``, and zero for
+    residuals.
 
     Parameters
     ----------
     plant, observer : DescriptorSystem, LinearObserver
-        With the names of their signals.
+        Plant and observer, with the names of their signals.
     T : FloatArray
         ``(nz, na)``.
     T0 : FloatArray, optional
-        ``(rows, na)`` with ``T0 E = 0``: the equations of the plant that the outputs add; none by default.
+        ``(rows, na)`` with ``T0 E = 0``: multiples of the plant's algebraic equations that are added to the outputs;
+        none by default.
     lag : int, optional
         Samples by which the state estimates lag.
     Phi, Cw : FloatArray, optional
-        The fault model ``(nw, nw)``, ``(nf, nw)`` that the observer holds; none by default.
+        The fault model ``(nw, nw)``, ``(nf, nw)`` of the observer; none by default.
     model_names : tuple of str, optional
         Names of the fault model's states.
     decoupled : bool, optional
-        Whether no disturbance reaches z or the outputs.
+        Whether no disturbance affects z or the outputs.
     later : int, optional
-        Samples by which the rows of ``observer`` are later than those of the shipped one.  Where outputs show inputs
-        of later samples (index 2 or more), errors of what reads them at once are a state only then.
+        Samples by which the outputs of ``observer`` are later than those of the shipped one.  For a plant of index 2 or
+        more, whose outputs depend on inputs of later samples, only delayed outputs have an error system.
     """
 
     plant: DescriptorSystem
@@ -120,7 +118,7 @@ class ErrorModel:
 
     def __post_init__(self) -> None:
         if not self.observer.order:
-            # Without a state of its own an observer follows nothing.
+            # An observer without states has no rows of T.
             object.__setattr__(self, "T", np.zeros((0, self.plant.nx * (self.lag + 1) + self._model_states)))
 
     @property
@@ -161,19 +159,19 @@ class ErrorModel:
 
     @cached_property
     def Bd(self) -> FloatArray:
-        """``(na, nd)`` of the disturbances that are decoupled."""
+        """``(na, nd)`` of the disturbances, if they are decoupled."""
         if not self.decoupled:
             return np.zeros((len(self.E), 0))
         return np.vstack([self.plant.Bd, np.zeros((len(self.E) - self.plant.nx, self.plant.nd))])
 
     @property
     def Dd(self) -> FloatArray:
-        """``(ny, nd)`` of the disturbances that are decoupled."""
+        """``(ny, nd)`` of the disturbances, if they are decoupled."""
         return self.plant.Dd if self.decoupled else np.zeros((self.plant.ny, 0))
 
     @cached_property
     def goal(self) -> FloatArray:
-        """``(rows, na)``: what each row of the observer's output stands for."""
+        """``(rows, na)``: the combination of xa that each output of the observer estimates."""
         observer, states = self.observer, self.plant.state_names
         goal = np.zeros((len(observer.Cz), len(self.E)))
         for row, name in enumerate(observer.state_names):
@@ -192,7 +190,7 @@ class ErrorModel:
 
     @property
     def fits(self) -> bool:
-        """Whether all shapes and names are those of plant and observer."""
+        """Whether all shapes and names agree with plant and observer."""
         plant, observer, count = self.plant, self.observer, self._model_states
         shapes = [(self.T, (observer.order, plant.nx * (self.lag + 1) + count))]
         shapes += [] if self.T0 is None else [(self.T0, (len(observer.Cz), shapes[0][1][1]))]
@@ -209,10 +207,10 @@ class ErrorModel:
 
     @property
     def numbers(self) -> tuple[FloatArray | None, ...]:
-        """All numbers beside the observer's."""
+        """All numbers except the observer's."""
         return (self.E, self.A, self.B, self.C, self.T, self.T0, self.goal, self.Bd, self.Dd, self.plant.D)
 
-    # The error e = T E x - z, of the plant's own states, and what drives it.
+    # The error e = T E x - z of the plant's own states, and its inputs.
 
     @property
     def own(self) -> FloatArray:
@@ -226,28 +224,29 @@ class ErrorModel:
 
     @cached_property
     def fault(self) -> FloatArray:
-        """``(nz, nf)``: faults, whatever their time course, to e."""
+        """``(nz, nf)``: from faults of any profile to e."""
         return self.driven_by(self.plant.Bf, self.plant.Df)
 
     @cached_property
     def disturbance(self) -> FloatArray:
-        """``(nz, nd)``."""
+        """``(nz, nd)``: from disturbances to e."""
         return self.driven_by(self.plant.Bd, self.plant.Dd)
 
     @cached_property
     def noise(self) -> FloatArray:
-        """``(nz, nw)``."""
+        """``(nz, nw)``: from noise to e."""
         return self.driven_by(self.plant.Bw, self.plant.Dw)
 
     def driven_by(self, b: FloatArray, d: FloatArray) -> FloatArray:
-        """Return ``T b - By d (nz, any)``: what drives e where a signal enters the plant by b and its outputs by d."""
+        """Return ``T b - By d (nz, any)``: from a signal with matrices b of the plant and d of its outputs to e."""
         return np.asarray(self.own @ b - self.observer.By @ d)
 
     def driven_at_most(self, b: FloatArray) -> FloatArray:
-        """Return what T could make of signals that enter the plant by ``b (nx, any)``, whatever cancels: ``(nz, any)``.
+        """Return bounds ``(nz, any)`` of the entries of ``T b`` without cancellation, for inputs ``b (nx, any)``.
 
-        T holds no more digits of an equation than of the row's largest one: where a signal enters, it may hold nothing
-        but rounding."""
+        The rounding errors of a row of T are relative to its largest entry, so that its entry for an equation in which
+        a signal enters may be rounding alone.
+        """
         if not self.observer.order:
             return np.zeros((0, b.shape[1]))
         equations = natural_scaling(self.plant).equations
@@ -255,7 +254,7 @@ class ErrorModel:
         return np.asarray(rows * np.max(equations[:, None] * np.abs(b), axis=0, initial=0.0))
 
     def output(self, rows: slice) -> Output:
-        """Return ``C, Df, Dd, Dw`` of some rows, which are ``-C e + Df f + Dd d + Dw w`` (states: the error)."""
+        """Return ``C, Df, Dd, Dw`` of some outputs ``-C e + Df f + Dd d + Dw w``; for estimates this is their error."""
         plant, direct = self.plant, self.observer.Dy[rows]
         added = np.zeros((len(direct), plant.nx)) if self.T0 is None else self.T0[rows, : plant.nx]
         signals = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
@@ -277,11 +276,11 @@ class ErrorModel:
         """See `output`."""
         return self.output(self.observer.state_rows)
 
-    # What stored numbers leave of its identities.
+    # The residuals of the identities, by rounding of stored numbers.
 
     @cached_property
     def remainder(self) -> RemainderChannel:
-        """What the identities miss, in outward rounding."""
+        """The residuals of the identities, in outward rounding."""
         return _remainders_of(self.observer).of(self.numbers, self._new_remainder)
 
     def _new_remainder(self) -> RemainderChannel:
@@ -292,7 +291,7 @@ class ErrorModel:
 
     @property
     def is_evaluated_exactly(self) -> bool:
-        """Whether what the identities miss comes out the same on every machine, all but one rounding."""
+        """Whether the residuals of the identities are the same on every machine, up to one final rounding."""
         return bool(max(self.observer.order, len(self.E), self.plant.ny) <= MOST_EXACT_IDENTITIES)
 
     def _remainder(self, kind: type[Ball] | type[ExtendedBall]) -> RemainderChannel:
@@ -310,9 +309,10 @@ class ErrorModel:
         remainder = RemainderChannel(*(_as_ball(part) for part in missed))
         if driven is None:
             return remainder
-        # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
+        # A nonzero T0 E multiplies the next state, which has the bounds of x, or in continuous time its derivative,
+        # which has none.
         ball = _as_ball(driven)
-        leakage = np.where(_there(ball), ball.magnitude, 0.0)
+        leakage = np.where(_is_nonzero(ball), ball.magnitude, 0.0)
         added = leakage if observer.dt > 0.0 else np.where(leakage > 0.0, np.inf, 0.0)
         return (
             replace(remainder, J=Ball(remainder.J.midpoint, remainder.J.radius + added)) if leakage.any() else remainder
@@ -320,7 +320,7 @@ class ErrorModel:
 
     @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Natural units of xa ``(na,)``, and in these the largest terms of each row of z and of the outputs."""
+        """Natural units of xa ``(na,)``, and the largest terms of each row of z and of the outputs in these units."""
         size, observer = np.abs, self.observer
         if self.lag or self.Phi is not None:
             units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
@@ -337,13 +337,14 @@ class ErrorModel:
         return units, np.where(state_sizes > 0.0, state_sizes, 1.0), np.where(output_sizes > 0.0, output_sizes, 1.0)
 
     def rounding(self) -> float:
-        """Return how much K and J are at most of the largest terms of their rows, in natural units of the states."""
+        """Return the largest entries of K and J relative to the terms of their rows, in natural units of the states."""
         units, state_sizes, output_sizes = self._sizes
         pairs = ((self.remainder.K.midpoint, state_sizes), (self.remainder.J.midpoint, output_sizes))
         return max(float(np.max(np.abs(missed) * units / rows, initial=0.0)) for missed, rows in pairs)
 
     def missed(self) -> float:
-        """Return the largest share that any identity misses of its terms: states, inputs, disturbances, ``T0 E``."""
+        """Return the largest residual of the identities relative to their terms, for states, inputs, disturbances and
+        ``T0 E``."""
         size, observer, channel = np.abs, self.observer, self.remainder
         t, t0 = size(self.T), np.zeros_like(self.goal) if self.T0 is None else size(self.T0)
         by, dy, dd, d = size(observer.By), size(observer.Dy), size(self.Dd), size(self.plant.D)
@@ -359,7 +360,7 @@ class ErrorModel:
             ((channel.U, channel.L), inputs, self.B),
             ((channel.W, channel.V), disturbances, self.Bd),
         ):
-            # Each signal in the unit in which it moves some row by its largest terms.
+            # Each signal is scaled by its largest effect on a row, relative to the terms of that row.
             missed, moved = (
                 np.vstack([part / row for part, row in zip(parts, rows, strict=True)])
                 for parts in ([size(part.midpoint) for part in balls], terms)
@@ -376,14 +377,15 @@ class ErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class ByNumbers(Generic[Made]):
-    """What was made of an observer beside the numbers of an error model: a design is given it, and verified.
+    """Results for an observer by the numbers of its error model, which a design and its verification share.
 
-    It must not hold the observer, beside which it is remembered."""
+    A result must not refer to the observer, since it is stored with it.
+    """
 
     known: list[tuple[tuple[FloatArray | None, ...], Made]] = field(default_factory=list)
 
     def of(self, numbers: tuple[FloatArray | None, ...], make: Callable[[], Made]) -> Made:
-        """Return what was made of the same numbers, or make it."""
+        """Return the result for the same numbers, or compute it."""
         for others, value in self.known:
             if all(map(_same, numbers, others)):
                 return value
@@ -401,9 +403,10 @@ def _remainders_of(_observer: LinearObserver) -> ByNumbers[RemainderChannel]:
 
 
 def error_model_row(model: ErrorModel | None, printed_digits: int | None, *, constants_allowed: bool = False) -> Check:
-    """Return the row that says whether a shipped observer follows what its error model says.
+    """Return the row of the report for the identities between a shipped observer and its error model.
 
-    ``constants_allowed``: constants that it adds to its outputs are checked by the method."""
+    ``constants_allowed``: the method checks constants that the observer adds to its outputs.
+    """
     name, claim = "error model", "the observer follows the plant, and its outputs are what they stand for"
     source = "Az T E + By C = T A, Bu + By D = T B, Cz T E + Dy C + T0 A = goal, Du + Dy D + T0 B = 0, T0 E = 0"
     added = model is not None and model.observer.constant is not None and not constants_allowed
@@ -425,7 +428,7 @@ def error_model_row(model: ErrorModel | None, printed_digits: int | None, *, con
 
 @dataclass(frozen=True, eq=False)
 class RemainderChannel:
-    """What the identities miss, as balls."""
+    """The residuals of the identities, as balls."""
 
     K: Ball  # (nz, n)
     U: Ball  # (nz, nu)
@@ -437,10 +440,10 @@ class RemainderChannel:
     def errors_per_unit(
         self, observer: LinearObserver, contraction: Contraction, *, closely: bool = False
     ) -> tuple[FloatArray, ...]:
-        """Return upper bounds on each output row's error for each state, input and disturbance always within one.
+        """Return upper bounds on the error of each output for each state, input and disturbance of at most one.
 
-        ``sum_j |c Az^j k| + |direct|``, outward rounded; ``(rows, n)``, ``(rows, nu)``, ``(rows, nd)``; ``closely``:
-        each of them by a sum of its own.
+        They are ``sum_j |c Az^j k| + |direct|``, rounded outwards, of the shapes ``(rows, n)``, ``(rows, nu)`` and
+        ``(rows, nd)``.  With ``closely``, each of them is computed by a sum of its own.
         """
         pairs = ((self.K, self.J), (self.U, self.L), (self.W, self.V))
         rows = observer.fault_rows
@@ -452,17 +455,17 @@ class RemainderChannel:
                 if closely
                 else contraction.gain(observer.Cz, k.midpoint, k.radius)
             )
-            # The rows that matter most get a tighter one.
+            # Fault estimates, which matter most, get a tighter bound.
             bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
-            # Of what is nothing exactly nothing comes.
-            direct_bound = np.where(_there(direct), direct.magnitude, 0.0)
-            bound = np.where(np.any(_there(k), axis=0), bound, 0.0) + direct_bound
+            # An input with an exact zero in all entries has no effect.
+            direct_bound = np.where(_is_nonzero(direct), direct.magnitude, 0.0)
+            bound = np.where(np.any(_is_nonzero(k), axis=0), bound, 0.0) + direct_bound
             errors.append(np.where(bound > 0.0, rounded_up(bound, 2), 0.0))
         return tuple(errors)
 
 
-def _there(ball: Ball) -> Any:
-    """Return where a ball holds more than an exact zero."""
+def _is_nonzero(ball: Ball) -> Any:
+    """Return where a ball is not an exact zero."""
     return (ball.midpoint != 0.0) | (ball.radius > 0.0)
 
 
@@ -478,6 +481,6 @@ def _as_ball(part: Ball | ExtendedBall) -> Ball:
 
 @remembered
 def contraction_of(observer: LinearObserver) -> Contraction | None:
-    """Return a proved contraction of a shipped observer's state, ``None`` where none is found."""
+    """Return a proved contraction of a shipped observer's state; ``None`` if none is found."""
     poles = poles_of(observer) if np.all(np.isfinite(observer.Az)) else None
     return prove_contraction(observer.Az, discrete=observer.dt > 0.0, poles=poles)

@@ -26,10 +26,14 @@ from obsynth.verification.disturbance_gains import (
     PlantWithStoredObserver,
     duration_limit,
 )
-from obsynth.verification.error_system import BOTH_BALLS, ByNumbers, ErrorModel, RemainderChannel, contraction_of
+from obsynth.verification.error_system import ByNumbers, ErrorModel, RemainderChannel, contraction_of
 
 #: Claimed bounds are enlarged for the rounding of the contraction on another machine, at most by this share.
 MOST_ROOM = 1.0
+
+#: Factor of claimed bounds from balls of double precision: the ball of another machine contains the same number, and so
+#: lies within three times the radius of this one.
+BOTH_BALLS = 3.0
 
 #: Observers with at most so many states get a separate sum for each bound when claimed bounds are recomputed.
 OWN_SUMS_UP_TO = 40

@@ -1,6 +1,7 @@
 """Monitors: a statistic, a threshold and a statement of its guarantee, run by ``init`` and ``step``.
 
-A record is a scan of it, many runs are an axis before the signals, and the horizon is a number of samples or none.
+A monitor is for records with a given number of samples, or for data of any length.  Many runs are evaluated together:
+they are an array axis before that of the signals.
 """
 
 from __future__ import annotations
@@ -45,27 +46,27 @@ STATEMENTS: Mapping[str, str] = {
     "of {false_alarms} at most, for Gaussian noise, once the initial-condition response has settled",
 }
 
-#: What a statement adds for a continuous design.
+#: Addition to the statement for a continuous design.
 BOUNDS_BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
 
-#: The assumption of a sampled design: what happens between its samples is not in its model.
+#: Assumption for a sampled design, whose model does not contain what happens between samples.
 HELD = "; inputs, disturbances are held between samples"
 
 BOUNDS_AND_HELD_INPUTS = BOUNDS_BETWEEN_SAMPLES + "; known inputs are held between samples"
 
-#: The other assumptions of every bound that is never passed.
+#: Further assumptions of every guaranteed bound.
 ASSUMED = "; the plant starts from zero, known inputs are held or straight lines between samples"
 
-#: How a statement begins, by what is watched: the residual may be made not to see the faults that are modelled.
+#: Beginning of a statement, by the watched signals.
 WHAT_IS_WATCHED: Mapping[Watched, str] = {
     Watched.RESIDUALS: "",
     Watched.ESTIMATES: "of the fault estimates, as modelled faults have no lasting effect on the residual: ",
 }
 
-#: What a recursive or nonlinear observer learnt from a sample: a row of it.
+#: The row of a recursive or nonlinear observer at a sample, with innovations and covariances.
 Evidence: TypeAlias = RawEstimate | DAERow
 
-#: In place of a fault's number: what is known does not distinguish the faults.
+#: In place of a fault's number if the data do not distinguish the faults.
 NOT_DISTINGUISHED = -1
 
 RuleState: TypeAlias = Any
@@ -74,10 +75,10 @@ RuleState: TypeAlias = Any
 def statement_of(
     kind: str, model: ResidualModel, assumed: Assumptions | None, *, watched: Watched, **numbers: float
 ) -> str:
-    """Return what a threshold promises and what it rests on; ``numbers``: window, false_alarms, change and dt."""
+    """Return the guarantee of a threshold with its assumptions; ``numbers``: window, false_alarms, change and dt."""
     ending = ""
     if kind in ("pointwise", "window"):
-        # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
+        # Disturbances of a sampled plant may move between samples if its continuous model is known.
         held = HELD if model.sampled is None else BOUNDS_AND_HELD_INPUTS
         ending = held if model.continuous is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
     words_of_numbers = {name: shown(value) for name, value in numbers.items()}
@@ -89,12 +90,12 @@ def statement_of(
 
 
 class LinearSample(NamedTuple):
-    """What a linear observer took and gave at one row: its own rows, known inputs, outputs; deviations."""
+    """Outputs, inputs and measurements of a linear observer at one row, as deviations from the operating point."""
 
-    rows: FloatArray
+    rows: FloatArray  # the observer's outputs: states, faults, residuals
     inputs: FloatArray
-    outputs: FloatArray
-    states: int  # how many of the rows are state estimates
+    outputs: FloatArray  # the measurements
+    states: int  # number of rows that are state estimates
 
     @property
     def faults_and_residuals(self) -> FloatArray:
@@ -103,61 +104,60 @@ class LinearSample(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a monitor takes: a row of estimates, deviations."""
+    """The input of a monitor: a row of estimates and residuals, as deviations from the operating point."""
 
     time: float  # seconds
     residuals: FloatArray  # ``(nr,)``
     faults: FloatArray  # ``(nf,)``
-    observation: Evidence | LinearSample | None  # by the observer; nothing in a gap
-    deciding: bool = True  # whether a decision may be taken: not in gaps, and not during the warm-up
-    skipped: int = 0  # rows that were missing before this one
-    bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
+    observation: Evidence | LinearSample | None  # the observer's row; `None` in a gap
+    deciding: bool = True  # whether the row may be decided: not in gaps, and not during the warm-up
+    skipped: int = 0  # number of rows that are missing before this one
+    bridged: bool = False  # whether all values missing since the warm-up were predicted by the plant's model
     inputs: FloatArray | None = None  # ``(nu,)``: known inputs, deviations
 
 
 class RuleOutput(NamedTuple):
-    """What a rule says of a row: the fault by its number, `NOT_DISTINGUISHED`, or `None` where the rule does not look
-    for it; and cells for columns of its own."""
+    """The output of a rule for one row."""
 
     statistic: float
     threshold: float
-    fault: int | None = None
-    cells: tuple[float, ...] = ()
-    ranking: Ranking | None = None  # of what an alarm may be, sensors among it, where that is known
+    fault: int | None = None  # its number, `NOT_DISTINGUISHED`, or `None` if the rule does not name faults
+    cells: tuple[float, ...] = ()  # values of the rule's own columns
+    ranking: Ranking | None = None  # of the possible causes of an alarm, including sensors, if it is known
 
 
 class MonitorOutput(NamedTuple):
-    """What a monitor says of one row: NaN where nothing is decided; without an alarm no fault is named."""
+    """The output of a monitor for one row: NaN where nothing is decided; a fault is named only in an alarm."""
 
     statistic: float
     threshold: float
     alarm: bool
     fault: str
-    more: tuple[float, ...] = ()
-    ranking: Ranking | None = None  # of what an alarm may be, where that is known
+    more: tuple[float, ...] = ()  # values of the rule's own columns
+    ranking: Ranking | None = None  # of the possible causes of an alarm, if it is known
 
 
 class MonitorState(NamedTuple):
-    """What goes from row to row."""
+    """The state of a monitor between rows."""
 
-    decided: bool  # whether a decision might be taken at the row before
+    decided: bool  # whether the row before might be decided
     rule: RuleState
 
 
 class Rule(ABC):
-    """A statistic and its threshold: values alone; a state is a tuple of numbers and arrays."""
+    """A statistic and its threshold.  A rule is immutable; its state is a tuple of numbers and arrays."""
 
-    #: Whether its threshold is never passed without a fault, which needs an error at the start that is as stated.
+    #: Whether its threshold is never exceeded without a fault, provided that the initial error is as stated.
     GUARANTEES: ClassVar[bool] = False
-    #: Whether its threshold adapts to the signals: `table` is then only what is added to.
+    #: Whether its threshold adapts to the signals; `table` is then only a part of it.
     adapts: ClassVar[bool] = False
-    #: Thresholds ``(any,)`` by the sample since the start, where they are known beforehand.
+    #: Thresholds ``(any,)`` by the sample since the start, if they are known in advance.
     table: FloatArray | None = None
     #: Columns of a run besides statistic, threshold and alarm.
     columns: tuple[str, ...] = ()
-    #: Whether it takes rows with missing samples (NaN) too.
+    #: Whether the rule accepts rows with missing samples (NaN).
     takes_gaps: bool = False
-    #: Whether its threshold knows what outputs that were missing have left, and holds right after a gap.
+    #: Whether its threshold includes the effect of earlier missing outputs, so that it is valid right after a gap.
     bridges: bool = False
 
     @abstractmethod
@@ -166,15 +166,15 @@ class Rule(ABC):
 
     @abstractmethod
     def step(self, state: RuleState, sample: Sample) -> tuple[RuleState, RuleOutput]:
-        """Return the state after a sample, and statistic and threshold at it."""
+        """Return the state after a sample, and the statistic and the threshold at it."""
 
     @abstractmethod
     def restart(self, state: RuleState, skipped: int = 0) -> RuleState:
-        """Return the state without windows and sums: rows are missing, or nothing may be decided any more."""
+        """Return the state with empty windows and sums, after missing rows or where decisions are suspended."""
 
     @abstractmethod
     def options(self) -> Any:
-        """Return what a saved state must share with the monitor that it is for."""
+        """Return the data by which a saved state is recognised as one of this rule."""
 
     def fold(self, state: RuleState, residuals: FloatArray) -> tuple[RuleState, Any]:
         """Return the state and the statistic ``(...)`` after residuals ``(..., nr)``, of one run or of many."""
@@ -188,39 +188,41 @@ class Rule(ABC):
         return values
 
     def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
-        """Return where runs pass thresholds ``limits (steps,)``, ``(steps, runs)``; ``norm``: their statistic."""
+        """Return where the statistic ``norm (steps, runs)`` of runs exceeds thresholds ``limits (steps,)``."""
         return np.asarray(norm > limits[:, None])
 
 
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """A statistic with its threshold, for records of one length or for data of any; values alone, so that one serves
-    any number of runs.  Made by `obsynth.monitor` and `obsynth.online_monitor`.
+    """A statistic with its threshold, for records of a given length or for data of any length.
+
+    It is immutable, so that one monitor serves any number of runs.  `obsynth.monitor` and `obsynth.online_monitor`
+    return monitors.
 
     Parameters
     ----------
     kind, statement : str
-        Which one, and what its threshold means.
+        The kind of the monitor, and the meaning of its threshold.
     rule : Rule
         Statistic and threshold.
     residuals : int
-        Columns of the residual that it watches.
+        Number of columns of the residual.
     fault_names : tuple of str
-        What an alarm may name.
+        Faults that an alarm may name.
     fault_scales : FloatArray
-        ``(nf,)``: what fault estimates are compared in.
+        ``(nf,)``: units in which fault estimates are compared to name a fault.
     horizon : int, optional
-        Samples of the records that it is for; without one, data may have any length.
+        Number of samples of the records; without it, data may have any length.
     dt : float, optional, seconds
-        Between samples of such records.
+        Time between samples of such records.
     floor : float, optional
-        What rounding may add to the statistic.
+        Bound on the effect of rounding on the statistic, which is added to the threshold.
     isolation_delay : int, optional
-        Samples from the alarm to the comparison.
+        Number of samples from the alarm to the comparison of the fault estimates.
     watched : Watched, optional
-        What it watches: the residuals, or fault estimates where the residuals do not see modelled faults.
+        The watched signals: residuals, or fault estimates if modelled faults do not affect the residuals.
     groups : tuple of tuple of str, optional
-        By row that is watched: an alarm of it proves that one of these faults is there.
+        For each watched row, the faults one of which is certainly present if this row is above its threshold.
 
     Examples
     --------
@@ -248,18 +250,18 @@ class Monitor:
     groups: tuple[tuple[str, ...], ...] = ()
 
     def __repr__(self) -> str:
-        """Return which monitor it is, and what its threshold means."""
+        """Return the kind of the monitor, and the meaning of its threshold."""
         return f"<Monitor {self.kind}: {self.statement}>"
 
     @property
     def threshold(self) -> FloatArray:
-        """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet.
+        """Thresholds ``(horizon,)`` of a record; infinite in rows that are not decided.
 
         Raises
         ------
         SpecError
-            The threshold is computed row by row: for data of any length, or as it follows inputs and outputs (of those,
-            `nominal_threshold` is the part that does not).
+            The threshold is computed row by row, since data may have any length, or since it depends on inputs and
+            outputs; `nominal_threshold` is the part that does not.
         """
         if self.rule.adapts and self.horizon is not None:
             raise SpecError(
@@ -272,8 +274,11 @@ class Monitor:
 
     @property
     def nominal_threshold(self) -> FloatArray:
-        """Thresholds ``(horizon,)`` of a record for the exact model: `threshold` itself; or, of an adaptive rule, what
-        tolerances and the start add to, which alone is no bound."""
+        """Thresholds ``(horizon,)`` of a record for the exact model.
+
+        For an adaptive rule the effects of tolerances and of the start are added to these, which alone are no bounds;
+        for other rules they are `threshold`.
+        """
         if self.horizon is None or self.rule.table is None:
             raise SpecError(
                 "This monitor is for data of any length: its threshold is computed by `step`.", path="monitor"
@@ -282,8 +287,8 @@ class Monitor:
 
     @property
     def guarantees(self) -> bool:
-        """Whether the threshold is never passed without a fault: nothing is decided until the effect of a gap has
-        settled."""
+        """Whether the threshold is never exceeded without a fault; after a gap, rows are not decided until its effect
+        has settled."""
         return self.rule.GUARANTEES
 
     @property
@@ -299,12 +304,12 @@ class Monitor:
         residuals : int
             Columns of its residual.
         fault_names : tuple of str
-            What it estimates.
+            Names of the faults that it estimates.
 
         Raises
         ------
         SpecError
-            They differ from those that are watched.
+            They differ from those of this monitor.
         """
         if residuals != self.residuals or fault_names != self.fault_names:
             raise SpecError("The monitor was made for another design.", path="monitor")
@@ -314,7 +319,7 @@ class Monitor:
         return MonitorState(False, self.rule.init())
 
     def step(self, state: MonitorState, sample: Sample) -> tuple[MonitorState, MonitorOutput]:
-        """Take one row of estimates; return the state after it, and what the monitor sees.
+        """Return the state after one row of estimates, and the decision.
 
         Parameters
         ----------
@@ -329,28 +334,28 @@ class Monitor:
             inner = self.rule.restart(inner, sample.skipped)
         inner, (statistic, threshold, number, more, ranking) = self.rule.step(inner, sample)
         after = MonitorState(sample.deciding, inner)
-        # A statistic that has overflowed has passed any threshold.
+        # A statistic that overflows (infinite) exceeds every threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
             return after, MonitorOutput(math.nan, math.nan, False, "", more)
         if statistic <= threshold + self.floor:
             return after, MonitorOutput(statistic, threshold, False, "", more)
         if number is None and self.fault_names and np.isfinite(sample.faults).all():
             number = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
-        # Between faults of the plant the rule decides where it can; sensors, and none of these, are ranked beside them,
-        # and so is what came after another change.
+        # The rule names a fault of the plant if it can.  The ranking is used if it names a sensor or none of the
+        # faults, and for changes that came after another one.
         decided = number is not None and number != NOT_DISTINGUISHED
         of_plant = ranking is None or (decided and math.isnan(ranking.ratio) and ranking.named in self.fault_names)
         fault = self._named(number) if of_plant or ranking is None else ranking.called(self.fault_names)
         return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
     def _named(self, number: int | None) -> str:
-        """Return the fault of a number, or the group of faults one of which is there for certain."""
+        """Return the name of a fault by its number, or the group of faults one of which is certainly present."""
         if number is None or number == NOT_DISTINGUISHED:
             return ""
         return " or ".join(self.groups[number]) if self.groups else (self.fault_names or ("",))[number]
 
     def as_data(self, state: MonitorState) -> dict[str, Any]:
-        """Return a state as plain data, with what it must share with the monitor that goes on from it.
+        """Return a state as plain data, with the kind and the options by which a monitor recognises it.
 
         Parameters
         ----------
@@ -360,7 +365,7 @@ class Monitor:
         return {"kind": self.kind, "options": self.rule.options(), "state": state_as_data(state)}
 
     def from_data(self, data: Mapping[str, Any]) -> MonitorState:
-        """Return the state that `as_data` described.
+        """Return the state from the data that `as_data` returned.
 
         Parameters
         ----------
@@ -399,27 +404,27 @@ class Monitor:
         return self.rule.statistics(residuals)
 
     def passed_in(self, runs: Runs, *, onset: int | None = None) -> NDArray[np.bool_]:
-        """Return at which samples of which runs the threshold is passed, ``(steps, runs)``.
+        """Return at which samples of which runs the threshold is exceeded, ``(steps, runs)``.
 
         Parameters
         ----------
         runs : Runs
-            Everything that happened in them.
+            The signals and estimates of the runs.
         onset : int, optional
-            First sample at which something is wrong; with it, only whether a run passes before that, and where it
-            passes first after that, need be right.
+            Sample of the first fault.  With it, the result is only exact in whether a run exceeds the threshold before
+            this sample, and in the first sample from there on at which it does.
         """
         observer: Any = runs.observer
         norm = self.statistic(runs.rows[:, :, self.watched.rows(observer)])
         return self.rule.passed_in(runs, norm, self.nominal_threshold + self.floor, onset)
 
     def isolated(self, faults: FloatArray, k: int) -> int:
-        """Return the number of the fault that an alarm points to, at ``k``; with `groups` it is proved.
+        """Return the number of the fault that an alarm at sample ``k`` points to; with `groups` it is proved.
 
         Parameters
         ----------
         faults : FloatArray
-            Fault estimates ``(steps, nf)``; of tests with `groups` the rows that are watched, each in its threshold.
+            Fault estimates ``(steps, nf)``; for tests with `groups` the watched rows, each in units of its threshold.
         k : int
             Sample of the alarm.
         """
@@ -427,7 +432,7 @@ class Monitor:
 
     @arguments_checked
     def watch(self, estimates: Estimates) -> Detection:
-        """Return what this monitor sees in a record.
+        """Return the statistic, the threshold and the first alarm of a record.
 
         Parameters
         ----------
@@ -437,7 +442,7 @@ class Monitor:
         Raises
         ------
         SpecError
-            Another number of samples than the monitor was made for, or a threshold that follows inputs and outputs.
+            The number of samples is not that of the monitor, or the threshold depends on inputs and outputs.
         """
         if self.columns:
             raise SpecError(
