@@ -1,7 +1,7 @@
-"""What the observer of a design returns on logs without faults, as thresholds are learned from it.
+"""Runs of a design's observer over logs without faults, from which thresholds are learned.
 
-Beside its estimates and residuals these are what the logs say of the observer itself: how far off outliers of a sensor
-are, from where states may start, and which wrong samples come in pairs.
+They give estimates and residuals.  The logs also show the sizes of outliers of each sensor, how far from the stated
+initial state a log may begin, and pairs of consecutive wrong samples; the observer is then run with these.
 """
 
 from __future__ import annotations
@@ -36,27 +36,28 @@ from obsynth.observers.changed_options import changed
 from obsynth.observers.outliers import checked_limit
 from obsynth.results.design import ObserverDesign
 
-#: Pairs may take this share of the rate of false alarms; where they would take more the levels are to hold with them.
+#: Pairs may cause this share of the false alarms.  If they would cause more, they are not removed, so that the levels
+#: include them.
 MOST_OF_RATE = 0.5
 
-#: Probability below which so many pairs are no chance: wrong samples, or something else, come in a row here.
+#: If so many pairs would occur by chance with less than this probability, consecutive wrong samples have another cause.
 CHANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class NormalRuns:
-    """A design, and how it runs on logs without faults."""
+    """A design with the options of its runs over logs without faults."""
 
     design: ObserverDesign
     columns: Mapping[str, str] | None
     scales: Mapping[str, float] | None
     gap: float | None
     warm_up: float | None
-    outlier_sizes: FloatArray | None = None  # ``(ny,)``: how far off outliers are, where logs say it otherwise
-    initial_covariance: FloatArray | None = None  # ``(nx, nx)``: of the states, where logs start elsewhere
+    outlier_sizes: FloatArray | None = None  # ``(ny,)``: sizes of outliers, if the logs contradict the design
+    initial_covariance: FloatArray | None = None  # ``(nx, nx)``: of the states, if logs begin too far off
 
     def begun(self) -> LogRun:
-        """Return a run at its start."""
+        """Return a run before its first row."""
         stated = {"outlier_sizes": self.outlier_sizes, "initial_covariance": self.initial_covariance}
         changes = {name: value for name, value in stated.items() if value is not None}
         design = self.design
@@ -65,20 +66,22 @@ class NormalRuns:
 
 
 class NormalOutput(NamedTuple):
-    """Runs on logs without faults as these logs set them, and what they return."""
+    """The options of runs over logs without faults, as far as these logs determine them, and the output of the runs."""
 
     runs: NormalRuns
     output: ObserverOutput
     pairs: WrongPairs
     dt: float  # seconds between samples
-    every: float  # rows in which one false alarm may be
+    every: float  # mean number of rows between false alarms
 
 
 def output_of_normal_logs(
     runs: NormalRuns, logs: NormalLogs, false_alarms: str | float, chosen: Sequence[tuple[int, int]]
 ) -> NormalOutput:
-    """Return what a design says of ``chosen`` rows of logs without faults, with outliers, starts and pairs of wrong
-    samples as these logs have them."""
+    """Return the output of an observer for ``chosen`` rows of logs without faults.
+
+    Sizes of outliers, the initial covariance and pairs of wrong samples are those of these logs.
+    """
     design = runs.design
     output, runs = _with_outlier_sizes(runs, logs)
     starts = started_anywhere(design.observer, output.starts)
@@ -93,15 +96,15 @@ def output_of_normal_logs(
 
 
 class ObserverOutput(NamedTuple):
-    """What an observer returns in each row of a log, as thresholds are learned from it."""
+    """The output of an observer in each row of logs, from which thresholds are learned."""
 
-    numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
+    numbers: NDArray[np.int64]  # ``(n,)``: numbers of the rows, from 0
     times: FloatArray  # ``(n,)`` seconds
-    watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
-    squares: FloatArray  # ``(n,)``: mean squares of innovations in the observer's own deviations, where it has these
-    scores: Scores | None  # of the faults, where it is known what samples say of these
-    starts: FloatArray  # ``(nx,)``: how far the estimated states have been from those at the start
-    refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
+    watched: FloatArray  # ``(n, m)``: NaN in rows that are missing or not decided
+    squares: FloatArray  # ``(n,)``: mean squares of innovations in units of their deviations, NaN without these
+    scores: Scores | None  # scores of the faults; `None` if the observer has none
+    starts: FloatArray  # ``(nx,)``: largest distances of the estimated states from the initial state
+    refused: list[FloatArray]  # ``(4, ny)`` each: state of the outlier gate after each row; empty without a gate
 
     def of_rows(self, ranges: Sequence[tuple[int, int]]) -> ObserverOutput:
         """Return the rows whose numbers are in some ranges."""
@@ -115,13 +118,13 @@ class ObserverOutput(NamedTuple):
         )
 
     def innovation_size(self) -> float:
-        """Return the root mean square of the innovations in the observer's own deviations, 1 where it has none."""
+        """Return the root mean square of the innovations in units of their deviations, 1 if there are none."""
         squares = self.squares[np.isfinite(self.squares) & (self.squares > 0.0)]
         return float(np.sqrt(squares.mean())) if squares.size else 1.0
 
 
 def _with_outlier_sizes(runs: NormalRuns, logs: NormalLogs) -> tuple[ObserverOutput, NormalRuns]:
-    """Return what a design says of rows without faults, and runs in which outliers are as far off as by these rows."""
+    """Return the output for rows without faults, and the runs with the sizes of outliers in these rows."""
     log, ends, run = logs.rows, logs.ends, runs.begun()
     if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
             and has_innovations_by_sensor(runs.design.observer)):  # fmt: skip
@@ -142,13 +145,22 @@ def _with_outlier_sizes(runs: NormalRuns, logs: NormalLogs) -> tuple[ObserverOut
 
 
 def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> list[FloatArray]:
-    """Return how far off the samples of each output were that a gate left out, and none of which it believed later, by
-    its memory after each row ``(4, ny)``; ``known (n,)``: whether the inputs of the row were."""
+    """Return the sizes of the residuals of outliers, for each output.
+
+    Outliers are samples that the gate rejected and did not accept later.
+
+    Parameters
+    ----------
+    refused : sequence of FloatArray
+        State of the gate after each row ``(4, ny)``.
+    known : array of bool
+        ``(n,)``: whether the inputs of the row were measured.
+    """
     memory = np.array(refused)
     distances = []
     for row, total, residual, believed in np.moveaxis(memory, 2, 0).transpose(0, 2, 1):
         gone, count = np.diff(total, prepend=0.0) > 0.0, np.abs(row)
-        # A run of samples that are far ends where the next one is near.
+        # A sequence of rejected samples ends with the first sample that is accepted.
         run = np.cumsum((count == 0.0) | ((count == 1.0) & (np.concatenate([[0.0], count[:-1]]) != 1.0)))
         moved = np.isin(run, run[believed != 0.0])
         distances.append(np.abs(residual[gone & ~moved & known & (residual != 0.0)]))
@@ -156,14 +168,24 @@ def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> li
 
 
 def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatArray) -> FloatArray:
-    """Return how far off outliers of each output are at least ``(ny,)``, of which some were so far off ``wrong``: what
-    is ``stated`` where these are few and further off.
+    """Return the least size of outliers of each output ``(ny,)``.
 
-    Their logarithms are taken as normal: one more is nearer with the probability `NEARER`, as its distance from their
-    mean in units of their deviation follows Student's t. Where that is within what any sample reaches (``usual``), it
-    says nothing of a sample that it is further off: the gate alone judges then. What is stated is not raised, and
-    without it the size stands half the way on a logarithmic scale: while a fault is followed, innovations are wider
-    than in rows without faults, and an outlier may be nearer than in these.
+    The logarithms of the sizes are assumed to be normal, so that the distance of a further one from their mean, in
+    units of their deviation, follows Student's t distribution; a further one is below the least size with the
+    probability `NEARER`.  A size below ``usual`` does not distinguish an outlier from other samples; it is raised to
+    ``usual``.  A stated size is never raised.  If there are few outliers, it is kept if all of them are larger, and
+    replaced by ``usual`` otherwise.  Without a stated size the result is the geometric mean of ``usual`` and the least
+    size: while the observer follows a fault, innovations are larger than in rows without faults, and an outlier may be
+    smaller than in these.
+
+    Parameters
+    ----------
+    wrong : sequence of FloatArray
+        Sizes of the outliers of each output.
+    usual : FloatArray
+        ``(ny,)``: sizes that other samples reach.
+    stated : FloatArray
+        ``(ny,)``: sizes that the design states; zero: none.
     """
     from scipy.special import stdtrit
 
@@ -181,8 +203,11 @@ def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatA
 
 
 def started_anywhere(observer: Any, reached: FloatArray) -> FloatArray | None:
-    """Return the covariance ``(nx, nx)`` of states at a start that may be wherever the plant has been, so far from the
-    observer's own ``(nx,)``; `None` where that is what the observer has."""
+    """Return the covariance ``(nx, nx)`` of the initial states if a run may begin anywhere in the logs.
+
+    ``reached (nx,)`` are the largest distances of the states from the observer's initial state.  The result is `None`
+    if the observer's own covariance includes them.
+    """
     if not reached.size:
         return None
     stated = np.asarray(observer.initial_covariance)
@@ -191,8 +216,10 @@ def started_anywhere(observer: Any, reached: FloatArray) -> FloatArray | None:
 
 
 def output_of_logs(runs: NormalRuns, log: FloatArray, ends: Sequence[tuple[int, int]]) -> ObserverOutput:
-    """Return what a design says of rows ``(n, 1 + nu + ny)`` of logs that begin and end where ``ends`` says, one after
-    the other with so many unknown rows between them that no statistic looks from one into another."""
+    """Return the output for the rows ``(n, 1 + nu + ny)`` of several logs, which ``ends`` divide.
+
+    Between two logs there are so many unknown rows that no statistic depends on rows of both.
+    """
     parts = []
     for first, last in ends:
         part = output_of_log(runs, log[first:last], first)
@@ -216,7 +243,7 @@ def output_of_logs(runs: NormalRuns, log: FloatArray, ends: Sequence[tuple[int, 
 
 
 def _unknown_rows(like: ObserverOutput, number: int) -> ObserverOutput:
-    """Return rows in which nothing is known, after those of a log whose last one has this number."""
+    """Return unknown rows, with the ``number`` of the last row of the log before them."""
     count = max(AGES)
     scores = None
     if like.scores is not None:
@@ -236,7 +263,7 @@ def _unknown_rows(like: ObserverOutput, number: int) -> ObserverOutput:
 
 
 def output_of_log(runs: NormalRuns, log: FloatArray, first: int) -> ObserverOutput:
-    """Return what a design says of rows ``(n, 1 + nu + ny)`` of one log, of which the first one has this number."""
+    """Return the output for the rows ``(n, 1 + nu + ny)`` of one log, whose first row has the number ``first``."""
     design, run = runs.design, runs.begun()
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
@@ -247,14 +274,14 @@ def output_of_log(runs: NormalRuns, log: FloatArray, first: int) -> ObserverOutp
     silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
     settling = settling_rows(design)
     gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
-    # Others than those with a covariance at the start cannot be told how far off a start may be.
+    # Only observers with an initial covariance can take into account how far off a start may be.
     stated = getattr(design.observer, "initial_state", ()) if hasattr(design.observer, "initial_covariance") else ()
     initial = np.asarray(stated, dtype=np.float64)
     starts = np.zeros(len(initial))
     for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
         if gate is not None:
             refused.append(gate.state.refused)
-        # Rows that are missing are among those that a monitor takes.
+        # A monitor also receives rows for missing samples.
         for row in () if last.status in STALE else (*last.missed, last):
             watched = watched_values(row.values[residuals], row.evidence)
             taken += 1
@@ -268,7 +295,7 @@ def output_of_log(runs: NormalRuns, log: FloatArray, first: int) -> ObserverOutp
             if watched is not None and isinstance(row.evidence, Evidence) and np.isfinite(watched).all():
                 own = row.evidence.whitened
                 square = float(np.mean(own**2)) if own.size else np.nan
-            # Longer gaps than the statistics look back are all the same.
+            # Gaps that are longer than the memory of the statistics all have the same effect.
             missing = min(row.skipped, max(AGES))
             records += [(first + count, row.time, nothing, np.nan, silent)] * missing
             records.append((first + count, row.time, nothing if watched is None else watched, square, score))
@@ -288,7 +315,7 @@ def output_of_log(runs: NormalRuns, log: FloatArray, first: int) -> ObserverOutp
 
 
 def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
-    """Yield the rows of a log, so many taken together."""
+    """Yield the rows of a log, read in parts of ``together`` rows."""
     for begin in range(0, len(log), together):
         yield from run.read(log[begin : begin + together])
 
@@ -296,7 +323,7 @@ def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
 def _without_pairs(
     runs: NormalRuns, logs: NormalLogs, observation: ObserverOutput, every: float
 ) -> tuple[ObserverOutput, WrongPairs]:
-    """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
+    """Return the output for rows without the pairs of wrong samples, and their number and probability."""
     from scipy.special import pdtrc
 
     if not observation.refused:
@@ -314,12 +341,13 @@ def _without_pairs(
     hidden = again(pairs)
     wrong = taken_back(pairs, hidden.refused, y)
     measured = np.isfinite(y).sum(axis=0)
-    # All of a pair are wrong samples: those that were believed too.
+    # Both samples of a pair are wrong, although the gate accepted the second one.
     last = np.sum([hidden.refused[end - 1][1] for _, end in ends], axis=0)
     refused = last + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(measured))
-    # A second comes with the same probability as the first, and in half of the cases on the same side.
+    # The second wrong sample has the same probability as the first, and is on the same side in half of the cases.
     chance = float(0.5 * np.sum((refused / np.maximum(measured, 1)) ** 2))
-    # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
+    # Chance explains this number of pairs if they are about as frequent as independent wrong samples make them, and
+    # they must leave at least half of the false alarms to other causes.
     are_chance = chance * every <= MOST_OF_RATE and float(pdtrc(len(wrong) - 1, chance * len(y))) >= CHANCE
     if not wrong or not are_chance:
         return observation, NO_PAIRS
@@ -327,5 +355,5 @@ def _without_pairs(
 
 
 def _sample_time(design: ObserverDesign, output: ObserverOutput) -> float:
-    """Return the seconds between samples: the design's, or the median of the log's where it is continuous in time."""
+    """Return the sample time: that of the design, or the median of the log for a continuous design."""
     return design.observer.dt or float(np.median(np.diff(output.times)))

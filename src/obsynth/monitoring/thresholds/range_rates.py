@@ -1,10 +1,11 @@
-"""How far the logs support that levels rise beyond the learned range of an input: by what of each statistic follows it.
+"""Rates at which levels rise beyond the learned range of an input: the share of each statistic that follows the input.
 
-A statistic's root is a seminorm of residuals, which are noise and the error of the model.  The logs say how large the
-error is that follows an input: a regression of the whitened rows on the input and what filters remember of it.  Beyond
-the range that part grows in proportion to the distance, and the noise as far as its size follows the input; the rest
-stays.  Uncertainty is that of the jackknife by blocks of rows (Kunsch 1989): where the logs cannot say, as an input
-hardly moves or a part of them says otherwise, the bound reaches one, and the whole root grows in proportion.
+The root of a statistic is a seminorm of the residuals, which consist of noise and the error of the model.  A regression
+of the whitened rows on an input and on filtered values of it gives the part of the error that follows the input.
+Beyond the range this part is assumed to grow in proportion to the distance, and so is the part of the noise whose size
+follows the input; the rest is constant.  The jackknife by blocks of rows (Kunsch 1989) gives a confidence bound of this
+rate.  If an input hardly moves, or parts of the logs disagree, the bound reaches one: the whole root then grows in
+proportion to the distance.
 """
 
 from __future__ import annotations
@@ -21,28 +22,28 @@ from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import Scores, change_ratios
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 
-#: Rows back that a regressor of its own has each, and shares of the exponential means of an input: what a residual
-#: remembers of it is between one row and as long as statistics look back.
+#: Regressors of an input: its values in so many last rows, and exponential means with these weights of the newest row.
+#: They cover memories of a residual from one row to that of the statistics.
 OWN_ROWS, SHARES = 3, (0.3, 0.1, 0.03, 0.01)
 
-#: Blocks of rows that are left out in turn: of one log, or of all logs, each in so many parts at least.
+#: Least number of blocks of rows that are left out in turn; each log is divided into equally many.
 BLOCKS = 8
 
-#: Confidence of the bound on what follows an input.
+#: Confidence of the bound on the rate.
 RATE_CONFIDENCE = 0.95
 
-#: Singular values below this share of the largest are of regressors that say the same.
+#: Singular values of the regressors below this share of the largest one count as zero.
 SAME_REGRESSORS = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows without faults, as regressions take them."""
+    """Rows without faults, with the data of the regressions."""
 
     regressors: tuple[FloatArray, ...]  # ``(n, p)`` of each input, of mean zero and deviation one
     distances: FloatArray  # ``(n, nu)``: of inputs from the middle of their ranges, in halves of these
-    white: FloatArray  # ``(n, m)``, zero where a row is not known
-    known: NDArray[np.bool_]  # ``(n,)``
+    white: FloatArray  # ``(n, m)``: whitened rows, zero where a row is unknown
+    known: NDArray[np.bool_]  # ``(n,)``: whether a row is known
     statistics: Statistics
     levels: FloatArray
     scores: Scores | None
@@ -56,9 +57,21 @@ def range_rates(
     scores: Scores | None,
     logs: Sequence[slice],
 ) -> FloatArray:
-    """Return which share of the root of each learned level follows each input, ``(nu, k)``, from whitened rows
-    ``(n, m)`` of logs and the ``distances (n, nu)`` of their inputs from the middles of their ranges, in halves of
-    these; ``scores``: what these rows say of faults."""
+    """Return the share of the root of each learned level that follows each input, ``(nu, k)``.
+
+    Parameters
+    ----------
+    distances : FloatArray
+        ``(n, nu)``: distances of the inputs from the middles of their ranges, in halves of these.
+    white : FloatArray
+        ``(n, m)``: whitened rows of the logs.
+    learned : LearnedThresholds
+        Statistics and levels.
+    scores : Scores or None
+        Scores of these rows for the faults.
+    logs : sequence of slice
+        Rows of each log.
+    """
     from scipy.special import stdtrit
 
     known = np.asarray(np.isfinite(white).all(axis=1))
@@ -83,7 +96,7 @@ def range_rates(
 
 
 def _held(distances: FloatArray) -> FloatArray:
-    """Return distances ``(n, nu)`` with those before where one is missing, and zero before any."""
+    """Return distances ``(n, nu)`` in which missing ones have the last known value, or zero at the beginning."""
     places = np.where(np.isfinite(distances), np.arange(1, len(distances) + 1)[:, None], 0)
     latest = np.maximum.accumulate(places, axis=0)
     padded = np.vstack([np.zeros((1, distances.shape[1])), distances])
@@ -91,7 +104,7 @@ def _held(distances: FloatArray) -> FloatArray:
 
 
 def _blocks(n: int, logs: Sequence[slice]) -> list[NDArray[np.bool_]]:
-    """Return rows ``(n,)`` without one block each: parts of the logs."""
+    """Return, for each block of the logs, which rows ``(n,)`` are outside it."""
     parts = list(logs) or [slice(0, n)]
     each = -(-BLOCKS // len(parts))
     ends = [np.linspace(part.start, part.stop, each + 1).astype(np.int64).tolist() for part in parts]
@@ -104,7 +117,8 @@ def _blocks(n: int, logs: Sequence[slice]) -> list[NDArray[np.bool_]]:
 
 
 def _regressors(distance: FloatArray) -> FloatArray:
-    """Return an input, its square, and what filters remember of both, of mean zero and deviation one."""
+    """Return the regressors of an input, scaled to mean zero and deviation one: its last values, its square, and
+    exponential means of both."""
     from scipy.signal import lfilter
 
     columns = [
@@ -118,7 +132,7 @@ def _regressors(distance: FloatArray) -> FloatArray:
 
 
 def _rates(rows: _Rows, chosen: NDArray[np.bool_]) -> FloatArray:
-    """Return the shares ``(nu, k)`` as ``chosen`` rows have them."""
+    """Return the shares ``(nu, k)`` in ``chosen`` rows."""
     followed = _followed(rows.regressors, rows.white, chosen & rows.known)
     parts = [rows.statistics.of_rows(np.where(rows.known[:, None], part, 0.0)[None])[:, 0] for part in followed]
     if rows.scores is not None:
@@ -131,8 +145,10 @@ def _rates(rows: _Rows, chosen: NDArray[np.bool_]) -> FloatArray:
 
 def _followed(regressors: Sequence[FloatArray], target: FloatArray, chosen: NDArray[np.bool_],
               weights: FloatArray | None = None) -> list[FloatArray]:  # fmt: skip
-    """Return what of a ``target (n, m)`` follows each input: by least squares over ``chosen`` rows, which count by the
-    root of ``weights (n,)``, with a constant."""
+    """Return the part of a ``target (n, m)`` that follows each input, by least squares with a constant.
+
+    The regression is over ``chosen`` rows with the ``weights (n,)``, one by default.
+    """
     table = np.hstack([np.ones((len(target), 1)), *regressors])
     roots = np.ones(len(target)) if weights is None else np.sqrt(weights)
     solution = np.linalg.lstsq(
@@ -143,13 +159,13 @@ def _followed(regressors: Sequence[FloatArray], target: FloatArray, chosen: NDAr
 
 
 def _of_faults(rows: _Rows, scores: Scores, chosen: NDArray[np.bool_]) -> list[FloatArray]:
-    """Return the statistics of faults ``(2 nf, n)`` of what follows each input in scores and estimates."""
+    """Return the statistics of faults ``(2 nf, n)`` for the part of scores and estimates that follows each input."""
     own = np.einsum("kii->ki", scores.information)
     away, theta = scores.away(rows.centre), scores.theta - rows.centre
     changes, squares = [], []
     for i in range(len(rows.centre)):
         informed = own[:, i] > 0.0
-        # A change of the fault that the sample alone would say.
+        # The estimate of the change of the fault from this sample alone.
         change = np.divide(away[:, i], own[:, i], out=np.zeros(len(own)), where=informed)
         by_change = _followed(rows.regressors, change[:, None], chosen & informed & rows.known, own[:, i])
         changes.append([part[:, 0] * own[:, i] for part in by_change])
@@ -164,8 +180,8 @@ def _of_faults(rows: _Rows, scores: Scores, chosen: NDArray[np.bool_]) -> list[F
 
 
 def _noise_rates(rows: _Rows, noise: FloatArray, chosen: NDArray[np.bool_]) -> FloatArray:
-    """Return by which share of its size at the end of the range the noise ``(n, m)`` grows with each distance,
-    ``(nu,)``."""
+    """Return the growth of the size of the noise ``(n, m)`` with the distance of each input ``(nu,)``, relative to its
+    size at the end of the range."""
     own = chosen & rows.known
     sizes = np.linalg.norm(noise[own], axis=1)
     table = np.hstack([np.ones((len(sizes), 1)), np.abs(rows.distances[own])])

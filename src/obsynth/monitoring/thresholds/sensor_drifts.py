@@ -1,9 +1,10 @@
-"""Allowed slow drifts of sensors: their effect on statistics, whether the logs show any or not.
+"""Allowed slow drifts of sensors and their effects on statistics, whether or not the logs show such drifts.
 
-A log without faults holds one drift of each sensor, or none; a later one may have another.  Each sensor may be off by
-so many deviations of its noise, slowly.  What that does to a linear observer's rows is a matrix, its steady state;
-other observers run again, with the offset added to each output in turn.  Their differences are linear to first order.
-Each sensor by itself: what each does along a direction adds up in squares, as drifts of sensors are independent.
+A log without faults contains one drift of each sensor, or none; a later log may contain another.  Each sensor is
+allowed an offset of so many deviations of its noise that develops slowly.  The effect on a linear observer is given by
+its steady-state gains.  Other observers are run again with the offset added to each output in turn; the differences
+between the runs are linear in the offset to first order.  The drifts of sensors are independent, so that squares of
+their effects are added.
 """
 
 from __future__ import annotations
@@ -25,37 +26,37 @@ from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
-#: An observer runs again over so many rows of a log: an offset has settled in the first half of them.
+#: Number of rows of a log over which an observer is run again; its response to an offset settles in the first half.
 DRIFT_ROWS = 3_000
 
-#: What a drift that nobody allows for does is judged over so many rows, and to this share of its size.
+#: Number of such rows where the smallest drift with an alarm is computed, and the relative accuracy of that drift.
 LIMIT_ROWS, LIMIT_SHARE = 1_000, 0.01
 
-#: Effects change with the inputs: this share of the rows has smaller ones.
+#: Effects of an offset depend on the inputs; this quantile over the rows is used.
 EFFECT_SHARE = 0.95
 
-#: The deviation of normal noise in its median absolute value, and the variance of third differences in that of samples.
+#: Ratio of the deviation of normal noise to its median absolute value, and of the variance of third differences of
+#: white noise to its own.
 MEDIAN_DEVIATIONS, THIRD_DIFFERENCES = 1.4826, 20.0
 
 
 class SensorDrifts(NamedTuple):
-    """What offsets of each sensor do, once they have settled: differences to the rows without them; of some sensors
-    nothing is known."""
+    """Settled effects of an offset of each sensor: the differences from rows without it."""
 
-    watched: FloatArray  # ``(ny, n, m)``: of fault estimates and residuals; NaN where nothing is known
-    away: FloatArray  # ``(ny, n, nf)``: of scores of changes of the faults; no rows where there are no scores
-    information: FloatArray  # ``(ny, n, nf)``: how much these rows say of each fault alone
-    theta: FloatArray  # ``(ny, n, nf)``: of the faults' estimates beside the scores
-    offsets: FloatArray  # ``(ny,)``: zero where no noise of a sensor is known
+    watched: FloatArray  # ``(ny, n, m)``: in fault estimates and residuals; NaN where unknown
+    away: FloatArray  # ``(ny, n, nf)``: in the scores of changes of the faults; no rows without scores
+    information: FloatArray  # ``(ny, n, nf)``: information of these rows on each fault alone
+    theta: FloatArray  # ``(ny, n, nf)``: in the fault estimates that belong to the scores
+    offsets: FloatArray  # ``(ny,)``: the offsets; zero for sensors whose noise is unknown
 
     def sensors_without(self) -> NDArray[np.bool_]:
-        """Return the sensors for which there is no room ``(ny,)``: those without noise, and those whose offset leaves
-        no row known."""
+        """Return the sensors for which no drift can be allowed ``(ny,)``: those without noise, and those whose offset
+        leaves no row known."""
         known = np.isfinite(self.watched).any(axis=(1, 2))
         return np.asarray((self.offsets == 0.0) | ~known)
 
     def white_means(self, statistics: Statistics, columns: list[int]) -> FloatArray:
-        """Return means of the effects on whitened rows, over as many rows as statistics look back: ``(ny, k, m)``."""
+        """Return means of the effects on whitened rows, over the memory of the statistics: ``(ny, k, m)``."""
         model = replace(statistics.model, offset=np.zeros(statistics.model.channels))
         white = model.whitened(self.watched[:, :, columns])[:, model.order :]
         known = np.asarray(np.isfinite(white).all(axis=2), dtype=bool)[:, :, None]
@@ -63,13 +64,13 @@ class SensorDrifts(NamedTuple):
         return np.asarray(_window_sums(np.where(known, white, 0.0)) / np.maximum(counts, 1.0))
 
     def bands(self, statistics: Statistics, means: FloatArray) -> FloatArray:
-        """Return offsets along each signature that are as large as these are there ``(s,)``."""
+        """Return the sizes of the offsets along each signature ``(s,)``."""
         lasting = statistics.responses()[0][: len(statistics.signature_names), -1]
         along = np.abs(means @ lasting.T) / np.maximum(np.sum(lasting**2, axis=1), np.finfo(float).tiny)
         return _together(along)
 
     def fault_bands(self) -> FloatArray:
-        """Return changes of each fault that are as large as these are there ``(nf,)``."""
+        """Return the sizes of the changes of each fault that correspond to the offsets ``(nf,)``."""
         power = _window_sums(self.information)
         with np.errstate(divide="ignore", invalid="ignore"):
             changes = np.where(power > 0.0, np.abs(_window_sums(self.away)) / power, 0.0)
@@ -79,8 +80,10 @@ class SensorDrifts(NamedTuple):
 def with_room_for_drifts(
     statistics: Statistics, levels: FloatArray, drifts: SensorDrifts, columns: list[int], size: float
 ) -> tuple[Statistics, FloatArray]:
-    """Return statistics in which no drift alarms, and levels ``(k,)`` of T2 and MEWMA with room for what these add,
-    where they have room for offsets of a ``size`` already; ``columns``: which are watched."""
+    """Return statistics with bands for the drifts, and levels ``(k,)``; those of T2 and MEWMA are raised.
+
+    The levels already allow for offsets of a ``size``.  ``columns`` are the watched ones.
+    """
     means = drifts.white_means(statistics, columns)
     bands, of_faults = drifts.bands(statistics, means), statistics.fault_bands
     if statistics.bands is not None:
@@ -98,8 +101,10 @@ def with_room_for_drifts(
 def drift_limits(
     statistics: Statistics, levels: FloatArray, drifts: SensorDrifts, columns: list[int], *, most: float = 1.0
 ) -> FloatArray:
-    """Return the least share ``(ny,)`` of the offset of each sensor that, without noise, passes a level of a statistic
-    for as long as it lasts; infinite where ``most`` of these offsets passes none."""
+    """Return the least multiple ``(ny,)`` of the offset of each sensor that exceeds a level as long as it lasts.
+
+    Noise is left out.  The result is infinite for sensors whose offset times ``most`` exceeds no level.
+    """
     white = np.median(drifts.white_means(statistics, columns), axis=1)
     rows = np.repeat(white[:, None], max(AGES), axis=1)
     faults = len(statistics.estimates) if drifts.away.size else 0
@@ -125,8 +130,11 @@ def drift_limits(
 
 
 def sensor_deviations(design: ObserverDesign, outputs: FloatArray) -> FloatArray:
-    """Return the deviation of the noise of each sensor ``(ny,)`` in the plant's units: as it is stated, or else as
-    ``outputs (n, ny)`` of a log have it, by differences in which slow changes are no more."""
+    """Return the standard deviation of the noise of each sensor ``(ny,)`` in the plant's units.
+
+    It is the stated one, or else it is estimated from ``outputs (n, ny)`` of a log by differences, in which slow
+    changes vanish.
+    """
     observer, plant = design.observer, design.plant
     stated = np.zeros(outputs.shape[1])
     if isinstance(observer, DAEObserver):
@@ -140,8 +148,8 @@ def sensor_deviations(design: ObserverDesign, outputs: FloatArray) -> FloatArray
 
 
 def _third_difference_deviation(column: FloatArray) -> float:
-    """Return the deviation of noise in samples ``(n,)`` by their third differences; zero where most of these vanish, as
-    those of a coarse, slow or stuck sensor."""
+    """Return the deviation of the noise in samples ``(n,)`` from their third differences; zero if most of these vanish,
+    as for a coarse, slow or stuck sensor."""
     third = np.diff(column, n=3)
     third = third[np.isfinite(third)]
     if not third.size:
@@ -150,8 +158,8 @@ def _third_difference_deviation(column: FloatArray) -> float:
 
 
 def linear_drifts(observer: LinearObserver, offsets: FloatArray) -> SensorDrifts:
-    """Return what offsets ``(ny,)`` of each sensor do to a linear observer in the steady state; refuse one that has
-    none."""
+    """Return the steady-state effects of offsets ``(ny,)`` of each sensor on a linear observer; raise `SpecError` if
+    there is no steady state."""
     held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
     try:
         gains = observer.Dy + observer.Cz @ np.linalg.solve(held, observer.By)
@@ -170,8 +178,10 @@ def linear_drifts(observer: LinearObserver, offsets: FloatArray) -> SensorDrifts
 
 
 def drifts_by_runs(run: Callable[[FloatArray], Any], offsets: FloatArray) -> SensorDrifts:
-    """Return what offsets ``(ny,)`` of each sensor do, by runs: ``run`` with what is added to the outputs ``(ny,)``
-    returns rows ``watched`` and ``scores``."""
+    """Return the effects of offsets ``(ny,)`` of each sensor by runs.
+
+    ``run`` takes the numbers that are added to the outputs ``(ny,)``, and returns rows ``watched`` and ``scores``.
+    """
     usual = run(np.zeros_like(offsets))
     half = len(usual.watched) // 2
     centre = usual.scores.centre() if usual.scores is not None and usual.scores.determine else None
@@ -195,7 +205,7 @@ def _of_scores(usual: Scores, other: Scores, centre: FloatArray) -> tuple[FloatA
 
 
 def _window_sums(values: FloatArray) -> FloatArray:
-    """Return sums over as many rows as statistics look back, of ``(ny, n, k)``; over all where there are fewer."""
+    """Return sums of ``(ny, n, k)`` over windows of the memory of the statistics; over all rows if there are fewer."""
     sums = np.cumsum(values, axis=1)
     length = min(max(AGES), values.shape[1])
     before = np.concatenate([np.zeros_like(sums[:, :1]), sums[:, :-length]], axis=1)
@@ -203,7 +213,7 @@ def _window_sums(values: FloatArray) -> FloatArray:
 
 
 def _together(effects: FloatArray) -> FloatArray:
-    """Return how large effects ``(ny, n, k)`` are in most rows, those of all sensors together: ``(k,)``."""
+    """Return the sizes ``(k,)`` of effects ``(ny, n, k)``: a quantile over rows, and the norm over sensors."""
     if not effects.shape[1]:
         return np.zeros(effects.shape[2])
     return np.asarray(np.linalg.norm(np.quantile(effects, EFFECT_SHARE, axis=1), axis=0))
