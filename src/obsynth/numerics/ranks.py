@@ -1,7 +1,7 @@
 """Rank decisions and square roots of covariances, and the tolerances of every decision on rank and sign.
 
-A rank is a decision, not a fact: each one reports the singular values on both sides of the cut, so that a reader sees
-how clear it was.  Other constants stand with their algorithm.
+A numerical rank is a decision: each one reports the singular values on both sides of the cut, so that a reader sees how
+clear it is.  Constants that decide neither ranks nor signs are in the module of their algorithm.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ WINDOW_RANK_TOLERANCE = 1e-9
 #: A gap between kept and dropped singular values smaller than this is reported as unclear.
 CLEAR_GAP = 1e3
 
-#: Directions of the outputs below this share of the largest, in units of their own, are of outputs that nearly depend
-#: on each other: an estimate that uses them has as many times the noise as this is small.
+#: Outputs nearly depend on each other if a direction of their rows, in natural units, is below this share of the
+#: largest.  An estimate that uses this direction amplifies noise by the inverse of that share.
 NEARLY_DEPENDENT = 0.1
 
 #: Distance from the stability boundary below which an eigenvalue or zero counts as lying on it.
@@ -36,13 +36,13 @@ HIDDEN_MODE_TOLERANCE = 1e-9
 #: Relative size below which a Markov parameter of a fault counts as zero.
 MARKOV_TOLERANCE = 1e-9
 
-#: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has decayed.
+#: A chain ``(TA)^k T f`` below this fraction of its a-priori bound counts as zero.
 DEAD_CHAIN_TOLERANCE = 1e-13
 
 #: An eigenvalue this close to the stability boundary is tested for lying on it (a multiple one scatters far).
 BOUNDARY_NEIGHBOURHOOD = 1e-2
 
-#: Singular value of a pencil, relative to its largest, below which rounding alone may have moved a zero away.
+#: Singular value of a pencil, relative to its largest, below which it is singular at a point up to rounding.
 BOUNDARY_RANK_TOLERANCE = 1e-13
 
 #: Zeros closer than this, relative to their size, are taken for one multiple zero when directions are assigned.
@@ -54,7 +54,7 @@ NEGLIGIBLE_INPUT = 1e-6
 #: Signals whose share in a null vector is at least this fraction of the largest share are named.
 NAMED_SHARE = 1e-3
 
-#: Result of a sum or product, relative to the sizes of its terms, below which it is only rounding.
+#: A sum or product below this share of the sizes of its terms is only rounding.
 CANCELLATION_TOLERANCE = 1e-14
 
 #: Largest eigenvalue, relative to the norm of the balanced matrix, below which all of them are rounding errors of zero.
@@ -63,81 +63,82 @@ NEGLIGIBLE_MODE = 1e-6
 #: Entries (i, j) and (j, i) of a covariance may differ by this much, relative to the standard deviations.
 SYMMETRY_TOLERANCE = 1e-10
 
-#: An eigenvalue of a correlation matrix above minus this is a rounded zero.
+#: A negative eigenvalue of a correlation matrix above minus this number, for each of its rows, is a rounded zero.
 DEFINITENESS_TOLERANCE = 1e-12
 
-#: An eigenvalue of a correlation matrix below this share of the largest, for each of its rows, is zero: entries are
-#: rounded by half of it, of two digits of a product that was rounded once, and so is the decomposition.
+#: An eigenvalue of a correlation matrix below this share of the largest, times its number of rows, counts as zero: this
+#: covers the rounding of the entries and of the decomposition.
 ROUNDED_EIGENVALUE = 4.0 * float(np.finfo(np.float64).eps)
 
-#: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
+#: A state counts as determined if its share of a diffuse direction is below the rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8
 
 #: Singular values of a scaled exact Jacobian below this share of the largest are zero.
 JACOBIAN_RANK_TOLERANCE = 1e-9
 
-#: Hankel singular values below this share of the largest are rounding: those of long windows end at 1e-7, and rounding
-#: of the factors of their Gramians begins at 1e-16.
+#: Hankel singular values below this share of the largest are rounding: significant ones of long windows end at 1e-7,
+#: and rounding of the factors of their Gramians begins at 1e-16.
 HANKEL_SHARE = 1e-13
 
-#: Directions of a Riccati solution below this share are not told from zero.
+#: Directions of a Riccati solution below this share count as zero.
 NEGLIGIBLE_SHARE = 1e-12
 
-#: Singular values of a set of directions below this share of the largest are no direction of their own.
+#: A set of directions has as many independent ones as singular values above this share of the largest.
 DIRECTION_SHARE = 1e-9
 
-#: Directions of signals in their own deviations that have less than this share of the mean variance follow from the
-#: others: what is in them is rounding, and how the signals depend on each other.
+#: Combinations of signals, each in units of its deviation, with less than this share of the mean variance count as
+#: zero: the signals depend on each other up to rounding.
 DEPENDENT_SIGNAL_SHARE = 1e-4
 
-#: A zero nearer than this to the point at which a constant fault stands is that point.
+#: A zero counts as lying at the point of a constant fault (1 in discrete, 0 in continuous time) up to this distance.
 REST_TOLERANCE = 1e-6
 
-#: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
+#: Singular values of a constant's effect below this share count as zero; the remainder bounds their effect.
 EFFECT_RANK_SHARE = 1e-12
 
-#: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times
-#: the condition of (7), which stays below 1e5 in models that can be used.
+#: Singular values of sensitivities below this share of the largest count as zero.  The sensitivities have relative
+#: rounding errors of 1e-16 times the condition of (7), which is below 1e5 in useful models.
 IDENTIFIABLE_SHARE = 1e-10
 
-#: Directions of the state that no constant touches are found down to this share of the others.
+#: Directions of the state that no constant affects are determined up to this share of the others.
 UNTOUCHED_SHARE = 1e-7
 
-#: Eigenvalues of the variances' information below this share of the largest are left out.
+#: Eigenvalues of the information on variances below this share of the largest are left out.
 LEAST_INFORMATION = 1e-10
 
-#: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
-#: what is kept has seven digits.
+#: Deviations below this share of the terms that they are computed from count as zero.  Rounding is seven orders
+#: smaller, so that larger ones have seven significant digits.
 KNOWN_SHARE = 1e-9
 
-#: What is zero but for rounding beside other terms ends at the rounding of these: this share of them counts among its
-#: own terms, so that bounds of 1e-9 to 1e-7 of its terms are above some hundred roundings of the others.
+#: A sum that vanishes in exact arithmetic is computed with the rounding errors of other terms in the same equation.
+#: This share of these terms is added to its own, so that bounds of 1e-9 to 1e-7 of its terms exceed the rounding errors
+#: of the others some hundred times.
 ROUNDED_BESIDE = 1e-4
 
-#: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
+#: A fault counts as decoupled if its column in a decoupled plant is below this share of its size before.
 TRACE_TOLERANCE = 1e-9
 
-#: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
+#: Parity directions whose noise is below this share of the terms in it, some rounding errors, count as noise-free.
 PERFECT_PARITY = 1e-14
 
-#: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
+#: A matrix of (7) counts as singular if its condition is above this, with three of sixteen digits left.
 SINGULAR_CONDITION = 1e13
 
-#: A value below this share of the largest of its range is zero but for rounding.
+#: A value below this share of the largest of its range is zero up to rounding.
 ROUNDED_ZERO = 1e-12
 
-#: Bounds of states whose moves differ by less than this share are dependent.
+#: Bounds of states count as dependent if their moves differ by less than this share.
 DEPENDENT_BOUND = 1e-13
 
 
 def rounding_rank(matrix: FloatArray) -> int:
-    """Return the rank to working precision: what rounding alone leaves of it."""
+    """Return the rank to working precision."""
     return int(np.linalg.matrix_rank(matrix))
 
 
 def first_independent(directions: FloatArray, count: int) -> list[int]:
-    """Return which rows, of unit length or zero, are the first that are independent to working precision, ``count`` of
-    them at most."""
+    """Return the first rows, at most ``count``, that are independent to working precision; each is zero or of length
+    one."""
     picked: list[int] = []
     for place in range(len(directions)):
         if len(picked) < count and rounding_rank(directions[[*picked, place]]) > len(picked):
@@ -146,8 +147,10 @@ def first_independent(directions: FloatArray, count: int) -> list[int]:
 
 
 def independent_directions(rows: FloatArray) -> FloatArray:
-    """Return the directions ``(m, r)`` of rows ``(n, m)`` of unit deviations, of which some may be NaN, that do not
-    follow from each other: the signals themselves where none does."""
+    """Return independent directions ``(m, r)`` of signals ``(n, m)`` with deviations of one, which may contain NaN.
+
+    If all signals are independent, the directions are the signals themselves.
+    """
     known = rows[np.isfinite(rows).all(axis=1)]
     sizes, vectors = np.linalg.eigh(known.T @ known / max(len(known), 1))
     significant = sizes > DEPENDENT_SIGNAL_SHARE * sizes.mean()
@@ -155,28 +158,28 @@ def independent_directions(rows: FloatArray) -> FloatArray:
 
 
 def but_rounding(sums: FloatArray, size_of_terms: FloatArray) -> FloatArray:
-    """Return sums without those that cancel down to the rounding of their terms; what is not a number stays that."""
+    """Return sums with zeros for those that cancel up to the rounding of their terms; NaN stays NaN."""
     return np.where(np.abs(sums) <= CANCELLATION_TOLERANCE * size_of_terms, 0.0, sums)
 
 
 def real_but_rounding(value: complex) -> float:
-    """Return the real part of a number, which beside a large imaginary part may be rounding alone: nothing then."""
+    """Return the real part of a number, or zero if it may be a rounding error of a large imaginary part."""
     return float(but_rounding(np.array(value.real), np.array(abs(value))))
 
 
 def product_but_rounding(matrix: Any, other: FloatArray, more: FloatArray | None = None) -> FloatArray:
-    """Return ``more + matrix other``; where its terms cancel down to their rounding, there is nothing."""
+    """Return ``more + matrix other`` with zeros where its terms cancel up to rounding."""
     product, terms = matrix @ other, abs(matrix) @ np.abs(other)
     return but_rounding(product, terms) if more is None else but_rounding(more + product, np.abs(more) + terms)
 
 
 @dataclass(frozen=True, eq=False)
 class RankDecision:
-    """A numerical rank with the evidence: all singular values, largest first, as decided upon (rows, columns scaled).
+    """A numerical rank with its evidence: the singular values of the scaled matrix, largest first.
 
-    ``smallest_kept``: relative to the largest; ``gap``: its ratio to the next, infinite when only exact zeros were
-    dropped, the distance to the tolerance when the rank is full; ``share``: the last value beside the terms it is a sum
-    of.
+    ``smallest_kept`` is the smallest singular value that counts as nonzero, relative to the largest.  ``gap`` is its
+    ratio to the next one; it is infinite if only exact zeros are dropped, and the ratio to the tolerance if the rank is
+    full.  ``share`` is the last value relative to the terms that it is a sum of.
     """
 
     rank: int
@@ -245,10 +248,10 @@ def decide_rank(
 
 
 def rank_in_any_units(first: FloatArray, second: FloatArray, *, expected: int) -> RankDecision:
-    """Decide whether a matrix has a rank by whichever of two scalings of it shows that better.
+    """Decide a rank by the one of two scalings of a matrix that gives the higher one.
 
-    Rounding of the entries is as small beside them in all units, so that no scaling makes a matrix look regular that
-    is not; one whose units drift apart, as along a chain of parts that hardly touch, makes it look singular.
+    Rounding errors are relative to the entries in all units, so that no scaling makes a singular matrix look regular.
+    A regular matrix may look singular if its units drift apart, as along a chain of weakly coupled parts.
     """
     decided = decide_rank(first, expected=expected)
     if decided.full and decided.clear:
@@ -258,7 +261,8 @@ def rank_in_any_units(first: FloatArray, second: FloatArray, *, expected: int) -
 
 
 def numerical_rank(values: FloatArray, *, scale: float | None = None, tolerance: float = RANK_TOLERANCE) -> int:
-    """Return how many singular values, the largest first, are not zero beside ``scale``: by default the largest."""
+    """Return how many singular values, sorted from the largest, are nonzero relative to ``scale``, by default the
+    largest one."""
     return int(np.sum(values > tolerance * (values[0] if scale is None else scale))) if values.size else 0
 
 
@@ -283,7 +287,7 @@ def rank_from(
 def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
     """Return ``F (n, n)`` with ``F F' = covariance``; zero variances and singular matrices are allowed.
 
-    Of the correlation matrix, so that variances of 1e-30 beside 1 keep all their digits.
+    The correlation matrix is factorised, so that variances of 1e-30 and of 1 have equally many digits.
     """
     if covariance.ndim != 2 or covariance.shape[0] != covariance.shape[1]:
         raise SpecError(f"{name} has shape {covariance.shape}: a covariance must be square.", path=name)
@@ -323,12 +327,12 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
             f"{name} is not positive semidefinite: its correlation matrix has the eigenvalue {values[0]:.3g}.",
             path=name,
         )
-    # The root of a rounding error of 1e-16 would be a deviation of 1e-8 in a direction that has none.
+    # Without this limit, an eigenvalue of 1e-16 by rounding would give a deviation of 1e-8.
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.where(values > rounding * values[-1], values, 0.0)))
 
 
 def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:
-    """Return whether a covariance is positive definite, by its correlations, so that units do not matter."""
+    """Return whether a covariance is positive definite, by its correlations, which do not depend on units."""
     variances = np.diag(covariance)
     if not np.all(variances > 0.0):
         return False

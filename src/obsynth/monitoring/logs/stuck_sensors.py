@@ -1,8 +1,8 @@
-"""Outputs that repeat one value for longer than the log itself makes probable: sensors that are stuck.
+"""Stuck sensors: outputs that repeat one value for improbably long.
 
-Repeats are counted row by row in constant memory, in streams as in files.  Normal logs decide after how many equal
-samples a sensor counts as stuck (`longest_repeats`); that is then decided in the row itself, whatever comes later
-(`Unrepeated`).
+Repeats are counted row by row in constant memory, for streams and files alike.  Logs without faults give the number of
+equal samples after which a sensor counts as stuck (`longest_repeats`).  In later runs each row is then decided without
+later rows (`Unrepeated`).
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 
-#: A run of repeats counts from so many samples on, and where it is so many times as long as any that is usual.
+#: A run of equal samples may be stuck if it has at least so many samples, and is so many times as long as usual ones.
 LEAST_RUN, TIMES_USUAL = 6, 3.0
 
-#: So many runs may be stuck; others must be this many to show what is usual.
+#: Largest number of runs that may be stuck, and least number of other runs, which show the usual lengths.
 MOST_STUCK_RUNS, LEAST_OTHER_RUNS = 100, 50
 
-#: Expected number of runs so long, by the longest of the others, below which none is chance, and the share of these.
+#: A run is not due to chance if the expected number of runs of its length is below this number.  That is extrapolated
+#: from the second share of the other runs, the longest ones.
 EXPECTED_RUNS, LONG_RUNS_SHARE = 1e-3, 0.1
 
-#: Third differences of noise change their sign in about three of four samples, those of a smooth course with more than
-#: four samples a period in fewer than half of them.
+#: Least share of sign changes of third differences in noise.  It is about three quarters for white noise, and less than
+#: a half for smooth signals with more than four samples a period.
 NOISY_REVERSALS = 0.5
 
-#: What comes to rest does so by changes that are this small beside the median one, or that shrink to a single step of
-#: its rounding, equal within the second share; what was at rest begins with changes to one side.  So many are looked
-#: at.
+#: A signal comes to rest if its last changes are below this share of the median one, or decrease to a single step of
+#: its resolution; changes count as equal within the second share.  A signal that was at rest begins with changes in one
+#: direction.  The third number is that of the changes that are considered.
 RESTING_CHANGE, SAME_STEP, LAST_CHANGES = 0.1, 0.01, 3
 
-#: Where noise makes the changes, at least this share of them turns back the one before.  If a sensor is so coarse that
-#: they are single steps, only what goes to one side, and takes longer from step to step, comes to rest.
+#: Changes by noise reverse the one before at least in this share of cases.  If the resolution of a noisy sensor is so
+#: coarse that its changes are single steps, it comes to rest only by steps in one direction at growing intervals.
 TURNED_SHARE = 0.5
 
-#: An alarm says that a sensor is stuck where it has repeated its value for so many rows more than it may: what it does
-#: not say would be missed, and no other alarm may come without it.
+#: An alarm is raised if a sensor has repeated its value for so many rows more than usual, since without its values
+#: faults may be missed, and no other alarm shows that.
 STUCK_ALARM_ROWS = 100
 
-#: Stretches in which an output is stuck that a note names.
+#: Largest number of stretches of a stuck output in a note.
 MOST_LISTED_RUNS = 3
 
-#: Rows of a stream that wait to be looked at together.
+#: Number of rows of a stream that are processed together.
 _WAITING_ROWS = 1024
 
 
@@ -55,23 +56,23 @@ class _Repeats(NamedTuple):
     length: int
     first: int
     last: int
-    before: tuple[float, ...]  # the last changes, of which the latest begins it
-    lengths: tuple[int, ...]  # of the runs between these
+    before: tuple[float, ...]  # the last changes; the run begins with the latest one
+    lengths: tuple[int, ...]  # lengths of the runs between these changes
 
 
 class _Output:
-    """What one output has shown so far."""
+    """The runs of equal samples of one output, and statistics of its changes."""
 
     def __init__(self) -> None:
-        self._lengths, self._long = Counter[int](), list[_Repeats]()
-        self._run: _Repeats | None = None  # the one that goes on
+        self._lengths, self._long = Counter[int](), list[_Repeats]()  # number of runs by length; the longest runs
+        self._run: _Repeats | None = None  # the present run
         self._opening, self._tail = np.zeros(0), np.zeros(0)  # first changes; last samples
-        self._sizes, self._step = Counter[int](), np.inf  # of changes: how many of which power of two; the smallest
-        self._reversals, self._pairs = 0, 0  # of third differences
-        self._turns = 0  # changes that go back on the one before
+        self._sizes, self._step = Counter[int](), np.inf  # number of changes by power of two; the smallest change
+        self._reversals, self._pairs = 0, 0  # sign changes of third differences, and pairs of these
+        self._turns = 0  # changes that reverse the one before
 
     def take(self, numbers: FloatArray, values: FloatArray) -> None:
-        """Take samples ``(n,)`` that were measured in the rows of these ``numbers (n,)``."""
+        """Add samples ``(n,)`` that were measured in the rows with these ``numbers (n,)``."""
         if not len(values):
             return
         recent = np.concatenate([self._tail, values])
@@ -83,7 +84,7 @@ class _Output:
         begins = np.flatnonzero(changed != 0.0)
         changes = changed[begins]
         if self._run is None:
-            changes = changes[1:]  # the first sample changes nothing
+            changes = changes[1:]  # the first sample is no change
         self._sizes.update(np.frexp(changes)[1].tolist())
         self._step = float(np.min(np.abs(changes), initial=self._step))
         before = () if self._run is None else self._run.before
@@ -96,7 +97,7 @@ class _Output:
             self._run = self._run._replace(length=self._run.length + int(edges[0]), last=int(numbers[edges[0] - 1]))
         lengths = np.diff(edges)
         if len(lengths):
-            # All but the last are over, and what went on before them is.
+            # All runs but the last have ended, including the one before these samples.
             if self._run is not None:
                 self._end(self._run)
                 earlier = (*earlier, self._run.length)
@@ -128,11 +129,11 @@ class _Output:
         return sorted(runs, key=lambda run: (-run.length, run.first))[:MOST_STUCK_RUNS]
 
     def stuck(self) -> list[tuple[int, int]]:
-        """Return first and last rows of the runs that are improbable beside the others, in order.
+        """Return first and last rows of improbably long runs, in order.
 
-        Lengths of the longest tenth of the others are taken as geometric beyond the shortest of these: so a sensor of
-        coarse steps, which repeats its value often, has to repeat it for longer.  Where a few runs alone are long,
-        these are compared with the rest.  What has no noise, or comes to rest, is not stuck.
+        The excess lengths of the longest tenth of the other runs are assumed to be geometric.  A sensor of coarse
+        resolution, which often repeats its value, therefore has to repeat it for longer.  If a few runs alone are long,
+        they are compared with the rest.  An output without noise, or one that comes to rest, is not stuck.
         """
         if not self.is_noisy:
             return []
@@ -149,12 +150,12 @@ class _Output:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether its samples move as noise does."""
+        """Whether its samples change as noise does, by the signs of third differences."""
         return self._run is not None and self._reversals >= NOISY_REVERSALS * max(self._pairs, 1)
 
     def longest_usual(self) -> int:
-        """Return how many samples in a row have been equal at most, where it was not stuck; zero where too few runs
-        show that, or it has no noise."""
+        """Return the largest number of equal consecutive samples while it was not stuck; zero if there are too few
+        runs, or no noise."""
         stuck = set(self.stuck())
         if not self.is_noisy:
             return 0
@@ -163,7 +164,7 @@ class _Output:
         return max(counts) if counts.total() >= LEAST_OTHER_RUNS else 0
 
     def _all_runs(self) -> tuple[Counter[int], list[_Repeats]]:
-        """Return how often runs of each length have been, and the longest of them, that which goes on among them."""
+        """Return the number of runs of each length, and the longest runs, both with the present one."""
         counts, runs = self._lengths.copy(), self._long
         if self._run is not None:
             counts[self._run.length] += 1
@@ -171,7 +172,7 @@ class _Output:
         return counts, self._longest(runs)
 
     def _rests(self, run: _Repeats) -> bool:
-        """Whether a run begins as that of a course without noise does that comes to rest, or was at rest before."""
+        """Whether a run belongs to a signal without noise that came to rest, or was at rest from the beginning on."""
         changes = np.array(run.before) if run.before else self._opening
         sizes = np.abs(changes)
         if (sizes <= RESTING_CHANGE * self._usual_change()).all():
@@ -186,7 +187,7 @@ class _Output:
         return bool(slower.all() and single[-1])
 
     def _usual_change(self) -> float:
-        """Return the median change, as the power of two below it."""
+        """Return the median size of the changes, rounded down to a power of two."""
         half, count = 0.5 * self._sizes.total(), 0
         for power in sorted(self._sizes):
             count += self._sizes[power]
@@ -196,7 +197,8 @@ class _Output:
 
 
 def _longest_tenth(counts: Counter[int]) -> tuple[int, float, int, int]:
-    """Return shortest, mean, longest and number of the longest tenth of lengths that occur so often."""
+    """Return the shortest, mean and longest length, and the number, of the longest tenth of runs; ``counts`` are their
+    numbers by length."""
     lengths = np.array(sorted(counts, reverse=True))
     often = np.array([counts[length] for length in lengths.tolist()])
     size = max(int(LONG_RUNS_SHARE * often.sum()), 1)
@@ -206,14 +208,14 @@ def _longest_tenth(counts: Counter[int]) -> tuple[int, float, int, int]:
 
 
 class RepeatedValues:
-    """Gathers rows of outputs, to tell which of them are stuck, and in which rows."""
+    """Collects rows of outputs, and returns which outputs are stuck, and in which rows."""
 
     def __init__(self, outputs: int) -> None:
         self._outputs = [_Output() for _ in range(outputs)]
         self._waiting, self._waits, self._rows = list[FloatArray](), 0, 0
 
     def take(self, values: FloatArray) -> None:
-        """Take rows ``(n, ny)``, NaN where nothing was measured; they are counted from 0."""
+        """Add rows ``(n, ny)``, NaN where nothing was measured; rows are counted from 0."""
         self._waiting.append(np.array(values))
         self._waits += len(values)
         if self._waits >= _WAITING_ROWS:
@@ -227,12 +229,12 @@ class RepeatedValues:
         self._waiting, self._waits, self._rows = [], 0, self._rows + len(values)
         for output, column in zip(self._outputs, values.T, strict=True):
             measured = np.isfinite(column)
-            # Wild numbers have differences that overflow, which are no repeats.
+            # Differences of very large numbers may overflow; these are no repeats.
             with np.errstate(over="ignore", invalid="ignore"):
                 output.take(numbers[measured], column[measured])
 
     def stuck(self) -> list[list[tuple[int, int]]]:
-        """Return by output the rows in which it is stuck."""
+        """Return, for each output, the rows in which it is stuck."""
         self._look()
         return [output.stuck() for output in self._outputs]
 
@@ -245,8 +247,7 @@ def stuck_rows(values: FloatArray) -> list[tuple[int, int]]:
 
 
 def without_repeats(values: FloatArray, stuck: Iterable[Sequence[tuple[int, int]]]) -> FloatArray:
-    """Return outputs ``(n, ny)`` with NaN for what each repeats in the rows in which it is stuck: no noise of its
-    sensor is there."""
+    """Return outputs ``(n, ny)`` with NaN for repeated values of stuck outputs, which have no noise of the sensor."""
     outputs = np.array(values)
     for i, runs in enumerate(stuck):
         for first, last in runs:
@@ -255,16 +256,17 @@ def without_repeats(values: FloatArray, stuck: Iterable[Sequence[tuple[int, int]
 
 
 def rising(times: Sequence[float], earlier: float = -np.inf) -> NDArray[np.bool_]:
-    """Return which rows come later than all before them, and than a time ``earlier`` than these ``(n,)``: others are
-    left out."""
+    """Return which rows ``(n,)`` are later than all rows before them, and later than a time ``earlier``."""
     latest = np.maximum.accumulate([earlier, *times[:-1]])
     return np.asarray(np.asarray(times) > latest)
 
 
 def longest_repeats(logs: Sequence[FloatArray]) -> FloatArray:
-    """Return from which equal sample in a row on each output says nothing any more ``(ny,)``, from normal logs
-    ``(n, ny)``: `TIMES_USUAL` times as many as there ever are where it is not stuck, or the second one where there are
-    never two; that costs one sample where it is chance. Infinite where it is not known."""
+    """Return the number of equal consecutive samples from which on each output counts as stuck ``(ny,)``.
+
+    It is `TIMES_USUAL` times the largest number in logs without faults ``(n, ny)``.  If these have no equal consecutive
+    samples, it is two, which costs one sample if it occurs by chance.  It is infinite if the logs do not show it.
+    """
     limits = np.full(logs[0].shape[1], np.inf)
     for i in range(len(limits)):
         outputs = [_Output() for _ in logs]
@@ -279,17 +281,19 @@ def longest_repeats(logs: Sequence[FloatArray]) -> FloatArray:
 
 
 class Unrepeated:
-    """Leaves out what each output repeats after so many equal samples ``longest (ny,)``, row by row: from then on, its
-    sensor may be stuck, and says nothing.  A missing sample is no other one."""
+    """Removes repeated values of each output from the equal sample number ``longest (ny,)`` on, row by row, since its
+    sensor may be stuck.  A missing sample does not end a run of equal ones."""
 
     def __init__(self, longest: FloatArray) -> None:
         self.longest = np.array(longest)
-        #: The last value of each output, and how many samples in a row have had it ``(2, ny)``.
+        #: The last value of each output, and the number of consecutive samples with this value ``(2, ny)``.
         self.memory = np.zeros((2, len(self.longest)))
 
     def of_rows(self, values: FloatArray, counted: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-        """Return outputs ``(n, ny)`` without what they repeat in rows that are ``counted (n,)``, and the memory after
-        each row ``(n, 2, ny)``; nothing is remembered yet."""
+        """Return outputs ``(n, ny)`` without repeated values, and the memory after each row ``(n, 2, ny)``.
+
+        Only rows that are ``counted (n,)`` are considered.  The own `memory` does not change.
+        """
         outputs, after = np.array(values), np.empty((len(values), 2, len(self.longest)))
         rows = np.arange(1, len(values) + 1)
         for i, (last, equal) in enumerate(self.memory.T.tolist()):
@@ -301,7 +305,7 @@ class Unrepeated:
             begun = np.maximum.accumulate(np.where(goes_on, -1, place))
             counts = place - begun + np.where(begun < 0, equal, 1.0)
             outputs[measured[counts >= self.longest[i]], i] = np.nan
-            # What is remembered after a row is what its last sample made it.
+            # The memory after a row is that after its last measured sample.
             latest = np.searchsorted(measured + 1, rows, side="right")
             after[:, 0, i] = np.concatenate([[last], own])[latest]
             after[:, 1, i] = np.concatenate([[equal], counts])[latest]
@@ -315,7 +319,7 @@ def _rows(first: int, last: int) -> str:
 def stuck_texts(
     stuck: Mapping[str, Sequence[tuple[int, int]]], rows_text: Callable[[int, int], str] = _rows, more: str = ""
 ) -> Iterator[str]:
-    """Yield a sentence on each output that is stuck: ``shown`` says its rows, ``more`` what to do if its sensor was."""
+    """Yield a sentence on each stuck output; ``rows_text`` formats its rows, and ``more`` ends the sentence."""
     for name, runs in stuck.items():
         if runs:
             where = ", ".join(rows_text(*run) for run in runs[:MOST_LISTED_RUNS])
