@@ -52,6 +52,9 @@ def test_set_points_beyond_those_of_the_normal_log_do_not_alarm_and_are_named() 
     assert "(4 to 6)" in text
     assert "reaches" in text
     assert "levels are up to" in text
+    # It said "levels are up to 1.92 (the least) to 3.4 (the largest) times as high there".
+    assert "the least" not in text.replace("matter least to", "")
+    assert "times as high" in text
     # As thresholds were before ranges were among them.
     without = obsynth.online_monitor(design(), "learned", normal=replace(learned(), ranges=None))
     assert obsynth.run_on_data(design(), log(1, 5.0), monitor=without).events != ()

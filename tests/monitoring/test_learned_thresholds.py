@@ -219,6 +219,10 @@ def test_rates_are_told_in_words() -> None:
     assert rows_per_alarm("1 per week", 60.0) == 10_080.0
     assert rows_per_alarm("2 per 1000 rows", 60.0) == 500.0
     assert rows_per_alarm("3/day", 1.0) == 28_800.0
+    # Abbreviations were refused, in a message that named no unit.
+    assert rows_per_alarm("1 per 10 min", 1.0) == 600.0
+    assert rows_per_alarm("1 per 90 s", 1.0) == 90.0
+    assert rows_per_alarm("2 per h", 1.0) == 1800.0
     assert rows_per_alarm(0.001, 1.0) == 1000.0
     for wrong in (
         "never",

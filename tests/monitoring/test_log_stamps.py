@@ -217,3 +217,14 @@ def test_what_a_stated_zone_is_not_for_is_refused() -> None:
     mixed = data.assign(time=[*data["time"][:50], *(f"{text}+01:00" for text in data["time"][50:])])
     with pytest.raises(obsynth.SpecError, match="cannot be mixed"):
         obsynth.run_on_data(design, mixed, time_zone="Europe/Berlin")
+
+
+def test_alarms_after_hours_are_in_hours_beside_for_people_and_not_for_programs() -> None:
+    """A log over days said 'First alarm 86760 s', whose picture has hours."""
+    plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1]], Bf=[[1]], dt=600.0)
+    design = obsynth.fault_estimation_filter(plant)
+    table = pd.DataFrame({"time": 600.0 * np.arange(100), "y1": np.zeros(100)})
+    table.loc[50:, "y1"] = 1.0
+    run = obsynth.run_on_data(design, table, thresholds={"fhat[f1]": 0.05})
+    assert "First alarm 30000 s (8.333 h)" in str(run)
+    assert run.as_dict()["alarm_stamps"] == {"fhat[f1]": "30000 s"}

@@ -40,7 +40,7 @@ DESIGN = obsynth.fault_estimation_filter(PLANT)
 def test_a_log_of_the_plant_agrees_from_another_start_and_beside_disturbances() -> None:
     found = [obsynth.validate(DESIGN, log_of(PLANT, seed)) for seed in range(2)]
     assert all(one.passed for one in found)
-    assert "unknown disturbances d1" in found[0].verdict[0]
+    assert "What the unknown disturbance 'd1' explains is not counted" in found[0].verdict[0]
     assert found[0].sensors["y1"].nis.samples == ROWS - 1
     assert not found[0].sensors["y2"].nis.samples
 

@@ -6,7 +6,14 @@ import pytest
 from obsynth.numerics.spectra import pole_text
 from obsynth.results.checks import information, lower_bound_check, upper_bound_check
 from obsynth.results.layout import shown_numbers
-from obsynth.results.number_texts import bound_number, complex_numbers, lower_number, number, upper_number
+from obsynth.results.number_texts import (
+    bound_number,
+    complex_numbers,
+    lower_number,
+    number,
+    point_in_time,
+    upper_number,
+)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -51,3 +58,16 @@ def test_what_is_rounding_of_a_number_is_not_printed() -> None:
     assert pole_text(np.exp(1j * np.pi)) == "-1"
     assert pole_text(complex(1e-17, 2.0), pair=True) == "0 +- 2j"
     assert pole_text(complex(1e-9, 1.0)) == "1e-09+1j"
+
+
+def test_long_times_are_in_hours_beside() -> None:
+    """Alarms of a log over days were reported as '86760 s' and '2.59326e+06 s', below a picture in hours."""
+    assert [point_in_time(value) for value in (7199.0, 7200.0, 86760.0, 2593260.0)] == [
+        "7199 s",
+        "7200 s (2 h)",
+        "86760 s (24.1 h)",
+        "2593260 s (720.4 h)",
+    ]
+    # Seconds since 1970 are no time since a start.
+    assert point_in_time(1.7e9) == "1700000000 s"
+    assert point_in_time(float("nan")) == "nan s"

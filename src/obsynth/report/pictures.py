@@ -23,6 +23,7 @@ from obsynth.report.plots.simulation import plot_simulation
 from obsynth.report.plots.spectra import plot_poles
 from obsynth.report.plots.trade_off import plot_delays
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import point_in_time
 from obsynth.results.registered import is_registered, registered
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.simulate import Simulation, simulate
@@ -175,7 +176,7 @@ def _detections(design: ObserverDesign, scenario: Scenario, simulation: Simulati
 
 def _story(scenario: Scenario, *, is_stated: bool, linear: bool) -> str:
     if is_stated:
-        return f"{scenario.horizon:g} s, seed {scenario.seed}."
+        return f"{point_in_time(scenario.horizon)}, seed {scenario.seed}."
     if not linear:
         return (
             "a step of one initial standard deviation, with the stated noise. The 95 % bands hold while the "

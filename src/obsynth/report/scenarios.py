@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.results.layout import headed_table, print_section, printed
-from obsynth.results.number_texts import duration, number
+from obsynth.results.number_texts import duration, number, point_in_time
 
 if TYPE_CHECKING:
     from obsynth.simulation.simulate import Simulation
@@ -50,7 +50,8 @@ def simulation_report(
     from obsynth.simulation.benches import WARM_UP_SHARE
 
     summary = simulation.summary()
-    console.print(Text(f"{name}: {summary['samples']} samples, {simulation.time[-1]:g} s", style="bold"))
+    length = point_in_time(float(simulation.time[-1]))
+    console.print(Text(f"{name}: {summary['samples']} samples, {length}", style="bold"))
     console.print()
     linear = not simulation.estimates.has_deviations
     for kind, title in (

@@ -19,6 +19,11 @@ LEAST_WITH_EXPONENT, LEAST_WITH_COMMAS = 7, 10_000
 #: A time is reported in a longer unit as well from so many of it on.
 LONG_TIMES = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 10.0))
 
+#: From so many seconds on (2 h) a time of a log or a scenario is reported in hours as well, as in pictures.
+#: From so many on six digits leave out seconds, and from so many on it is no time since a start, but one since 1970.
+HOURS_FROM, MORE_DIGITS_FROM, LONGEST_RUN = 7200.0, 1e6, 1e9
+SECONDS_OF_HOUR = 3600.0
+
 
 def number(value: float, *, digits: int = 4) -> str:
     """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold.
@@ -69,6 +74,13 @@ def duration(seconds: float, *, digits: int = 3) -> str:
         if abs(seconds) >= least * size:
             return f"{text} ({number(seconds / size, digits=digits)} {unit})"
     return text
+
+
+def point_in_time(seconds: float) -> str:
+    """Return a time of a log or a scenario in seconds, and from two hours on in hours as well: ``86760 s (24.1 h)``."""
+    text = f"{seconds:.10g} s" if abs(seconds) >= MORE_DIGITS_FROM else f"{seconds:g} s"
+    is_long = HOURS_FROM <= abs(seconds) < LONGEST_RUN
+    return f"{text} ({seconds / SECONDS_OF_HOUR:.4g} h)" if is_long else text
 
 
 def complex_numbers(values: Iterable[complex]) -> str:

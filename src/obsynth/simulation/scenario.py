@@ -17,6 +17,7 @@ from obsynth.numerics.suggestions import fields_suggested, suggestion
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
+from obsynth.results.number_texts import point_in_time
 from obsynth.simulation.profiles import (
     Additive,
     Drift,
@@ -359,8 +360,8 @@ def _require_begun(scenario: Scenario) -> None:
         for name, profile in profiles_of(scenario, group):
             if profile.start > scenario.horizon:
                 raise SpecError(
-                    f"{name!r} among the {group} begins at {profile.start:g} s, and the scenario ends at "
-                    f"{scenario.horizon:g} s: begin earlier, or give a longer horizon.",
+                    f"{name!r} among the {group} begins at {point_in_time(profile.start)}, and the scenario ends at "
+                    f"{point_in_time(scenario.horizon)}: begin earlier, or give a longer horizon.",
                     path=f"{group}.{name}",
                 )
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.results.layout import headed_table
-from obsynth.results.number_texts import bound_number
+from obsynth.results.number_texts import bound_number, point_in_time
 
 #: Number of blanks between columns.
 _BLANKS_BETWEEN = 2
@@ -30,7 +30,7 @@ def printed_runs(outcome: Any, width: int, *, rest: str) -> Any:
     rows = []
     for run in outcome.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
-        alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
+        alarm = f"{first} at {point_in_time(run.alarms[first])}" if first else "-"
         rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
     return _printed(outcome, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width, rest)
 

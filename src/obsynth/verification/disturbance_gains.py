@@ -18,6 +18,7 @@ from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.modes import modes_of, poles_of
 from obsynth.plants.pencil import structure_of
+from obsynth.results.number_texts import duration
 from obsynth.verification.error_system import ErrorModel
 
 #: The lowest frequency (rad per sample) of a claimed gain, and the number of frequencies.  Slower disturbances are only
@@ -188,15 +189,14 @@ def duration_limit(system: PlantWithStoredObserver, level: float, unit: float, b
         seconds = min(seconds, float(np.log(max(level / max(largest_remainder, SMALLEST), 1.0)) / rate))
         return (
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
-            f"state is not held down, they matter after about {seconds:.3g} s"
+            f"state is not held down, they matter after about {duration(seconds)}"
         ), seconds
     if not np.isfinite(seconds):
         above = np.flatnonzero(system.gains(np.array(SLOWER) * unit) > level)
         seconds = per_unit / SLOWER[above[0]] if above.size else np.inf
     if np.isfinite(seconds):
         return (
-            f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
-            f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
+            f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about {duration(seconds)}"
         ), seconds
     seconds = per_unit / SLOWER[-1]
-    return f"{_ON_THE_BOUNDARY}; they do not matter within {seconds:.3g} s", seconds
+    return f"{_ON_THE_BOUNDARY}; they do not matter within {duration(seconds)}", seconds

@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.results.number_texts import duration
 
 #: Gains below this are no explanation: three nats are one in twenty.
 LEAST_EXPLANATION = 3.0
@@ -100,7 +101,8 @@ def _of_sensors(innovations: FloatArray, names: Sequence[str], dt: float) -> lis
         candidates.append((f"an offset of the sensor {name}", gain))
         gain, first, _ = _regression_on_previous(column)
         if first > 0.0:
-            lasting = f" over about {-dt / np.log(min(first, 1.0 - 1.0 / len(column))):.2g} s"
+            seconds = -dt / float(np.log(min(first, 1.0 - 1.0 / len(column))))
+            lasting = f" over about {duration(seconds, digits=2)}"
             candidates.append((f"noise of {name} that is correlated{lasting}", gain))
     return candidates
 

@@ -21,6 +21,7 @@ from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.unit_check import UnitCheck
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.suggestions import quoted_names
 from obsynth.observers.changed_options import changed
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -108,8 +109,11 @@ def notes_on_disturbances(design: ObserverDesign, sensors: Mapping[str, SensorVa
         return []
     together = [name for name, sensor in sensors.items() if not sensor.nis.samples]
     unpredicted = (
-        f" One by one {', '.join(together)} cannot be predicted; what remains of them together is in the NIS."
+        f" By {'itself' if len(together) == 1 else 'themselves'} {quoted_names(together)} cannot be predicted; what "
+        "the disturbances leave of all outputs together is in the NIS."
         if together
         else ""
     )
-    return [f"What the unknown disturbances {', '.join(names)} explain is no disagreement.{unpredicted}"]
+    one = len(names) == 1
+    explained = f"{'' if one else 's'} {quoted_names(names)} {'explains' if one else 'explain'}"
+    return [f"What the unknown disturbance{explained} is not counted as a disagreement.{unpredicted}"]

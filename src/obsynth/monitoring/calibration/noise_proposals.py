@@ -28,6 +28,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.noise import noise_state, process_variance
 from obsynth.plants.transformations.noise_states import with_noise
+from obsynth.results.number_texts import duration
 
 #: Numbers that a state adds: the variance and correlation of coloured noise, the variance of a walk.
 ADDED_NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
@@ -61,7 +62,7 @@ _STATE_SENTENCES = {
 
 _REPLACED = (
     "Process noise may stand for coloured noise of {name} here: with noise of {name} that is correlated over about "
-    "{time:.2g} s, the log needs it no longer, and is better by {gain:.3g} nats. As it is, a design follows {name}, "
+    "{time}, the log needs it no longer, and is better by {gain:.3g} nats. As it is, a design follows {name}, "
     "and its monitor may not see a fault of that sensor. If the noise is coloured, state this (sensor_noise: "
     "{{{name}: {{correlation: unknown}}}} in calibrate)."
 )
@@ -120,7 +121,7 @@ def proposed_states(
             sentences.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
         states, value, start, needed_before = tried, reached, place, needed
     remarks = [
-        _REPLACED.format(name=name, time=np.exp(time), gain=gain)
+        _REPLACED.format(name=name, time=duration(float(np.exp(time)), digits=2), gain=gain)
         for name, (gain, time, numbers) in replacements.items()
         if numbers <= needed_before()
     ]

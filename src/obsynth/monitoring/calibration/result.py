@@ -14,6 +14,7 @@ from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plants.calibrated_box import CalibratedBox
 from obsynth.report.plots.panels import BAND_STYLE, WIDTH, new_figure, tidy
+from obsynth.results.number_texts import duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -184,7 +185,7 @@ class Calibration:
         for name, noise in self.sensor_noise.items():
             lines.append(
                 f"  coloured noise of {name}: deviation {noise['deviation']:.3g}, correlation "
-                f"{noise['correlation']:.3g} s"
+                f"{duration(noise['correlation'])}"
             )
         for name in self.offset:
             value, deviation = self.found_offsets.get(name, (0.0, np.inf))

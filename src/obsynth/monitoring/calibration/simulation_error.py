@@ -16,6 +16,7 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae_functions import Compiled
 from obsynth.plants.noise import offset_state
+from obsynth.results.number_texts import point_in_time
 
 BoolArray = NDArray[np.bool_]
 
@@ -194,10 +195,11 @@ def without_solution(problem: CalibrationProblem) -> str:
     if not len(lost):
         return ""
     row, log = int(lost[0]), problem.log
+    stamp = point_in_time(float(log.time[row]))
     shorter = "integration: radau or substeps: 10" if problem.integration != "radau" else "substeps: 10"
     values = ", ".join(f"{name} = {value:.4g}" for name, value in zip(problem.unknown, problem.nominal, strict=True))
     return (
-        f" With {values} the step of {log.dt:.4g} s to row {log.rows[0] + row} (at {log.time[row]:.6g} s) has none, as "
+        f" With {values} the step of {log.dt:.4g} s to row {log.rows[0] + row} (at {stamp}) has none, as "
         f"where a reaction ignites within a step: {shorter} may have one."
     )
 

@@ -55,6 +55,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import duration
 
 #: A variance is reported if the log likelihood with the design's value is lower by so many nats than with the likeliest
 #: one, the other variances being at their likeliest values.
@@ -573,7 +574,8 @@ def _sentences(
 def _spectrum(sensor: SensorValidation, dt: float) -> str:
     """Return a text on the periods with the largest power of the innovations; empty if the log is too short."""
     rows, multiple = sensor.power
-    return f", {multiple:.2g} times their mean power at periods of about {rows * dt:.2g} s" if rows else ""
+    period = duration(rows * dt, digits=2)
+    return f", {multiple:.2g} times their mean power at periods of about {period}" if rows else ""
 
 
 def _white(sensors: Mapping[str, SensorValidation]) -> bool:

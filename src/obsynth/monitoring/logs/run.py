@@ -134,7 +134,7 @@ class DataRun:
             "statuses": dict(self.statuses),
             "alarms": dict(self.alarms),
             "alarm_rows": dict(self.alarm_rows),
-            "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
+            "alarm_stamps": {name: self.stamps.written(time) for name, time in self.alarms.items()},
             "events": [event.as_dict() for event in self.events],
             "rows_in_alarm": rows_in_alarm(self.events),
             "silent": dict(self.silent),

@@ -18,6 +18,7 @@ from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.measurement_units import MICRO_SIGNS
 from obsynth.plants.input_derivatives import derivative_of
+from obsynth.results.number_texts import point_in_time
 
 #: What a missing sample may look like in a log.
 MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})
@@ -441,10 +442,12 @@ class Stamps:
         return np.where(missing, np.nan, seconds)
 
     def shown(self, seconds: float) -> str:
-        """Return a time as the log writes it."""
-        if not self.is_dated or not math.isfinite(seconds):
-            return f"{seconds:g} s"
-        return self.date(seconds)
+        """Return a time for people: as the log writes it, and long ones in seconds in hours as well."""
+        return self.date(seconds) if self.is_dated and math.isfinite(seconds) else point_in_time(seconds)
+
+    def written(self, seconds: float) -> str:
+        """Return a time for programs: as the log writes it."""
+        return self.date(seconds) if self.is_dated and math.isfinite(seconds) else f"{seconds:.10g} s"
 
     def date(self, seconds: float) -> str:
         """Return the date and time of some seconds, ISO 8601, in the zone of the log."""

@@ -17,6 +17,7 @@ from obsynth.observers.recursive.irregular_steps import IrregularSteps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.smoothing_chain import SmootherHistory
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import point_in_time
 
 
 class SteppingLogObserver(LogObserver):
@@ -98,8 +99,9 @@ class SteppingLogObserver(LogObserver):
         """Return a text where the observer started again as its model had no solution."""
         if not self.restarts:
             return ()
+        first = point_in_time(self.first_restart)
         return (
-            f"In {counted(self.restarts, 'row')} (the first at {self.first_restart:.6g} s) the model had no solution "
+            f"In {counted(self.restarts, 'row')} (the first at {first}) the model had no solution "
             "from the estimates before, and the observer started again: estimates there are those of the start, with "
             "its deviations. Either the model does not hold for these rows, or its steps are too long for them "
             "(integration, dt).",

@@ -20,6 +20,9 @@ UNITS = {
     "year": 31557600.0,
 }
 
+#: Their usual abbreviations.
+_ABBREVIATIONS = {"s": "second", "sec": "second", "min": "minute", "h": "hour", "hr": "hour", "d": "day"}
+
 _WRITTEN_RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z]+?)s?\s*")
 
 
@@ -30,7 +33,8 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
     if is_finite_number(rate):
         per_alarm = 1.0 / float(rate) if float(rate) > 0.0 else None
     elif isinstance(rate, str) and (match := _WRITTEN_RATE.fullmatch(rate.lower())) is not None:
-        unit = 1.0 if match.group(3) in ("row", "sample") else UNITS.get(match.group(3), 0.0) / dt
+        word = _ABBREVIATIONS.get(match.group(3), match.group(3))
+        unit = 1.0 if word in ("row", "sample") else UNITS.get(word, 0.0) / dt
         try:
             alarms, count = float(match.group(1)), float(match.group(2) or 1.0)
         except ValueError:
@@ -38,7 +42,9 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
         per_alarm = count * unit / alarms if alarms > 0.0 and math.isfinite(alarms) and count * unit > 0.0 else None
     if per_alarm is None or not math.isfinite(per_alarm):
         raise SpecError(
-            f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows'.", path="false_alarms"
+            f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows', "
+            f"by {', '.join(UNITS)} or row.",
+            path="false_alarms",
         )
     if per_alarm < 2 * HOLD:
         raise SpecError(

@@ -27,6 +27,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import point_in_time
 from obsynth.simulation.benches import make_bench
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.over_tolerances.stated_tolerances import with_tolerances
@@ -104,7 +105,7 @@ def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     return (
         f"never passed without {' or '.join(group)} while disturbances and noise keep the bounds of the design"
         f"{f', for {words}' if words else ''}{least}; "
-        f"a fault {test.fault} of {upper_text(test.surely_found, 6)} raises an alarm within {test.delay:g} s"
+        f"a fault {test.fault} of {upper_text(test.surely_found, 6)} raises an alarm within {point_in_time(test.delay)}"
     )
 
 

@@ -177,8 +177,9 @@ class RowsBeyond:
                 continue
             rates = np.ones(1) if ranges.rates is None else ranges.rates[i]
             least, most = (f"{(1.0 + float(rate) * (distance - 1.0)) ** 2:.3g}" for rate in (rates.min(), rates.max()))
+            by_statistic = "" if least == most else f" (of the statistic that they matter least to, {least} times)"
             yield text + (
-                f"levels are up to {most if least == most else f'{least} (the least) to {most} (the largest)'} times "
-                f"as high there, and {max(AGES) - 1} rows longer, as far as the normal logs do not exclude errors of "
-                "the model that grow with it. Smaller faults are missed: add a normal log with such values."
+                f"alarm levels are up to {most} times as high{by_statistic} in these rows and the {max(AGES) - 1} "
+                "rows after them, as the normal logs do not show how far errors of the model grow there. Smaller "
+                "faults are missed: add a normal log with such values."
             )

@@ -29,6 +29,7 @@ from obsynth.report.plots.panels import (
     tidy,
     with_unit,
 )
+from obsynth.results.number_texts import point_in_time
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -405,7 +406,7 @@ def plot_residuals(
         crossed = np.flatnonzero(size > curve)
         if crossed.size:
             first = int(crossed[0])
-            label = f"first above it at k = {first} ({time[first]:g} s)"
+            label = f"first above it at k = {first} ({point_in_time(time[first])})"
             mark(panel, time[first], size[first], label, marker=marker, color=style["color"])
     return finish(panel, "norm of the residual\n(units of the outputs)")
 

@@ -21,6 +21,7 @@ from obsynth.report.plots.panels import (
     new_panels,
     one_panel,
 )
+from obsynth.results.number_texts import point_in_time
 from obsynth.simulation.simulate import Simulation
 
 if TYPE_CHECKING:
@@ -114,8 +115,8 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     alarm = decision.alarm
     if alarm is not None:
         blamed = f": {alarm.parameter}" if alarm.parameter else ""
-        mark(panel, dt * alarm.k, alarm.value, f"alarm at {dt * alarm.k:g} s{blamed}")
-        panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {dt * alarm.onset:g} s")
+        mark(panel, dt * alarm.k, alarm.value, f"alarm at {point_in_time(dt * alarm.k)}{blamed}")
+        panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {point_in_time(dt * alarm.onset)}")
     return finish(panel, _DECISION_LABELS.get(decision.statistic, decision.statistic))
 
 
@@ -253,5 +254,6 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
             panel.set_ylim(least, ROOM_ABOVE * max(most, usual))
     if detection.k is not None:
         blamed = f": {detection.fault}" if detection.fault else ""
-        mark(panel, time[detection.k], detection.values[detection.k], f"alarm at {detection.time:g} s{blamed}")
+        label_of_alarm = f"alarm at {point_in_time(float(time[detection.k]))}{blamed}"
+        mark(panel, time[detection.k], detection.values[detection.k], label_of_alarm)
     return finish(panel, label)
