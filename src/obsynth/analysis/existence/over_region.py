@@ -21,6 +21,7 @@ from obsynth.analysis.existence.turning_filter import TurningFilter, has_turning
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.scaling import Scaling
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import SCHEDULED_MATRICES, PolytopicSystem
 
@@ -47,7 +48,8 @@ class FilterOverRegion:
     """The parts of a filter that do not change: with the plant's sensor faults as states.
 
     ``T (n, n)``, ``N (n, ny)``, ``Bf0 (nx, nf)``, ``Psi (n, nf)``, ``Upsilon (ny, nf)``; ``Delta`` ``(nf, nf)`` at each
-    vertex; ``reach``: a proved bound on ``|Delta^-1|`` over the hull; ``vertices``: the plant's, with Bf0 as Bf.
+    vertex; ``reach``: a proved bound on ``|Delta^-1|`` over the hull; ``vertices``: the plant's, with Bf0 as Bf;
+    ``scaling``: units of ``work`` in which its middle is balanced.
     """
 
     T: FloatArray
@@ -59,6 +61,31 @@ class FilterOverRegion:
     reach: float
     vertices: tuple[DescriptorSystem, ...]
     work: tuple[DescriptorSystem, ...]
+    scaling: Scaling
+
+    def balanced(self) -> FilterOverRegion:
+        """Return the parts with ``work`` in balanced units; faults and disturbances, and ``vertices``, stay."""
+        own, states = self.scaling, self.scaling.states[:, None]
+        work = tuple(
+            vertex.replace(
+                exact=None,
+                E=own.scale_dynamics(vertex.E),
+                A=own.scale_dynamics(vertex.A),
+                **{name: own.scale_input(getattr(vertex, name)) for name in ("B", "Bf", "Bd", "Bw")},
+                C=own.scale_output(vertex.C),
+                **{name: own.scale_feedthrough(getattr(vertex, name)) for name in ("D", "Df", "Dd", "Dw")},
+            )
+            for vertex in self.work
+        )
+        return replace(
+            self,
+            T=self.T / states / own.equations,
+            N=self.N / states / own.outputs,
+            Psi=self.Psi / states,
+            Upsilon=own.scale_feedthrough(self.Upsilon),
+            work=work,
+            scaling=Scaling(*(np.ones_like(factors) for factors in (own.equations, own.states, own.outputs))),
+        )
 
 
 def conditions_over_region(plant: PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
@@ -373,4 +400,4 @@ def _constant_parts(
     full = decide_rank(Upsilon, expected=plant.nf).full
     indexes = [int(index or 0) for index in prepared.detectability.indexes]
     indexes = indexes if full or any(index != 1 for index in indexes) else [0] * plant.nf
-    return FilterOverRegion(T, N, Bf0, Psi, Upsilon, Delta, reach, vertices, work), indexes
+    return FilterOverRegion(T, N, Bf0, Psi, Upsilon, Delta, reach, vertices, work, prepared.scaling), indexes

@@ -146,8 +146,7 @@ def certified(
     try:
         return _found(search, level, margin, decay, fast_decay=fast_decay)
     except SolverError as error:
-        ended = None if error.record is None else error.record["status"]
-        if level is not None or ended == "infeasible" or not whole.constant_output:
+        if level is not None or error.record.get("status") == "infeasible" or not whole.constant_output:
             raise
     # A solver may end without numbers in one set of coordinates and with them in another.
     search = replace(search, units=ErrorUnits.of(whole, combined=False))

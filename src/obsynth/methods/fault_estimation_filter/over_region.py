@@ -66,16 +66,18 @@ def synthesise_over_region(
         return synthesise_turning(plant, method, parts, progress=progress)
     if parts is None:  # every condition holds, so there are parts
         raise SpecError("The plant has no filter over its region.", path="plant")
-    W = np.asarray(np.linalg.pinv(parts.Upsilon))
-    errors, _, _ = errors_over_region(parts, W)
+    # The paper's W is that of the outputs as they are; a free one is sought in balanced units.
+    balanced = parts if method.asks_for_free_weight is False else parts.balanced()
+    W = np.asarray(np.linalg.pinv(balanced.Upsilon))
+    errors, _, _ = errors_over_region(balanced, W)
     steps = plant.scheduling.usable_step_of(plant.dt)
     progress("solving the inequalities at the vertices")
     certificate = _certified(errors, method, parts, steps)
     decoupled = _decoupled(errors, method, parts)
     progress("building the realisation and its certificate")
     if decoupled is not None and not (certificate.is_negligible and certificate.decay < decoupled.decay**MUCH_FASTER):
-        return _synthesis(plant, method, parts, W, decoupled, None, decoupled=True)
-    return _synthesis(plant, method, parts, W, certificate, steps)
+        return _synthesis(plant, method, (parts, balanced), W, decoupled, None, decoupled=True)
+    return _synthesis(plant, method, (parts, balanced), W, certificate, steps)
 
 
 def _decoupled(
@@ -115,26 +117,36 @@ def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synth
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, _, _ = errors_over_region(parts, W)
     method = FaultEstimationFilter()
-    return _synthesis(plant, method, parts, W, _certified(errors, method, parts, None, gains=R, margin=0.0), None)
+    certificate = _certified(errors, method, parts, None, gains=R, margin=0.0)
+    return _synthesis(plant, method, (parts, parts), W, certificate, None)
 
 
 def _synthesis(
     plant: PolytopicSystem,
     method: FaultEstimationFilter,
-    parts: FilterOverRegion,
+    in_units: tuple[FilterOverRegion, FilterOverRegion],
     W: FloatArray,
     certificate: VertexCertificate,
     steps: float | None,
     *,
     decoupled: bool = False,
 ) -> Synthesis:
-    errors, L0, U2 = errors_over_region(parts, W)
+    """Return the filter of a certificate; ``in_units``: its parts as they are, and in the units of the certificate."""
+    parts, own = in_units
+    errors, L0, U2 = errors_over_region(own, W)
     # L0 is that of the pseudoinverse: another W changes R alone.
-    own = W if certificate.output is None else W + certificate.output @ U2.T
-    gains: dict[str, FloatArray] = {"T": parts.T, "N": parts.N, "W": own, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
+    weight = W if certificate.output is None else W + certificate.output @ U2.T
     R = certificate.gains * (errors.count if len(certificate.gains) == 1 else 1)
-    L = [first + r @ U2.T for first, r in zip(L0, R, strict=True)]
+    states, outputs = (np.ones(1), np.ones(1)) if own is parts else (parts.scaling.states, parts.scaling.outputs)
+    L = [states[:, None] * (first + r @ U2.T) * outputs for first, r in zip(L0, R, strict=True)]
+    gains: dict[str, FloatArray] = {
+        "T": parts.T, "N": parts.N, "W": weight * outputs, "Psi": parts.Psi, "Upsilon": parts.Upsilon
+    }  # fmt: skip
     gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
+    witness = certificate.witness
+    P = [matrix / states / states[:, None] for matrix in witness.P]
+    G = None if witness.G is None else [matrix / states / states[:, None] for matrix in witness.G]
+    certificate = replace(certificate, witness=replace(witness, P=P, G=G))
     observer, tracking = _realised(plant, parts, gains, L, certificate.decay)
     matrices = {"tracking": tracking, **stored_witness(certificate.witness)}
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}
