@@ -29,11 +29,11 @@ from obsynth.verification.plant import condition_rows
 if TYPE_CHECKING:
     import cvxpy
 
-#: Whom a bisection asks where Clarabel has no answer, and within how many steps: where SCS refutes (45) at four states,
-#: hundreds suffice, and next to the least level no number does.
+#: Solver with settings for levels of a bisection at which Clarabel has no result.  Where SCS proves that (45) is
+#: infeasible at four states, hundreds of iterations suffice; next to the least level no number of them does.
 SECOND_OPINION: tuple[str, Mapping[str, Any]] = ("SCS", {"max_iters": 5000})
 
-#: How names begin of constraints that a user gives without one; a number follows.
+#: Beginning of the names of constraints that a user gives without a name; a number follows.
 OWN = "own "
 
 #: Numbers by name, such as the values of variables.
@@ -86,11 +86,11 @@ class Conditions:
 
     @cached_property
     def existence(self) -> VerificationReport:
-        """The checks of whether there is a solution at all, and why not; they need no solver for the inequalities."""
+        """The checks of whether a solution exists, with the reason if none does; no inequality is solved for them."""
         return VerificationReport.of(condition_rows(self._examined()))
 
     def gains(self) -> dict[str, FloatArray]:
-        """Return the gain matrices of the variables' present values, by the paper's letters.
+        """Return the gain matrices for the present values of the variables, by the paper's letters.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class Conditions:
         return gains
 
     def design(self, *, name: str = "design") -> ObserverDesign:
-        """Return the verified design of the variables' present values.
+        """Return the verified design for the present values of the variables.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class Conditions:
         return design.replace(solver={**design.solver, "conditions": self.source, "status": str(self.problem.status)})
 
     def require_satisfied(self, names: Iterable[str]) -> None:
-        """Raise where the present values do not satisfy constraints: what verifies a design knows the paper's alone.
+        """Raise `SolverError` if the present values violate constraints; verification only checks those of the paper.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class Conditions:
 
     @arguments_checked
     def solve(self, *, solver: str | None = None, settings: Mapping[str, Any] | None = None) -> float:
-        """Solve the problem, as ``problem.solve()`` does; what goes wrong in a solver is a `SolverError`.
+        """Solve the problem as ``problem.solve()`` does, but raise `SolverError` for any failure of the solver.
 
         Parameters
         ----------
@@ -175,8 +175,8 @@ class Conditions:
         Returns
         -------
         float
-            The least value of the objective: 0 where there is none, infinite where the solver says that there is no
-            solution.  ``problem.status`` says what the solver found.
+            The least value of the objective: 0 without an objective, infinite if the solver reports that there is no
+            solution.  ``problem.status`` is the status of the solver.
 
         Raises
         ------
@@ -225,10 +225,10 @@ class Conditions:
         settings: Mapping[str, Any] | None = None,
         tolerance: float = 1e-3,
     ) -> Bisection:
-        """Return at which value of a parameter the conditions change from feasible to infeasible.
+        """Return the value of a parameter at which the conditions change from feasible to infeasible.
 
-        A solver that fails says nothing of a level: such levels are listed as unknown, and others near them are tried.
-        Values count only where they satisfy the constraints.
+        Levels at which a solver fails are listed as unknown, and others near them are tried.  A level counts as
+        feasible only if the values satisfy the constraints.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ class Conditions:
         settings : mapping, optional
             Settings of the solver by its own names; without one those of Clarabel.
         tolerance : float, optional
-            Ends where the interval is below this share of the feasible level.
+            The bisection ends when the interval is below this share of the feasible level.
 
         Returns
         -------
@@ -254,9 +254,9 @@ class Conditions:
         Raises
         ------
         SpecError
-            There is no such parameter, or the solver calls the level that is given as feasible infeasible.
+            There is no such parameter, or the level ``feasible`` is infeasible according to the solver.
         SolverError
-            The solver has no answer there: inconclusive.
+            The solver has no result at the level ``feasible``: inconclusive.
 
         Examples
         --------

@@ -1,6 +1,7 @@
 """Kalman gains with a prescribed rate of decay (Anderson, Moore, "Linear optimal control", 1971, section 4).
 
-The default needs no numbers: as fast as a fixed price in noise allows.  This compromise is ours.
+The default gain needs no numbers from the user: it is as fast as a fixed factor of noise above the least one allows.
+This compromise is our own.
 """
 
 from __future__ import annotations
@@ -17,44 +18,45 @@ from obsynth.numerics.doubling import continuous_riccati_solution
 from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution, doubled_solution
 from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
 
-#: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
+#: Number of times that the Riccati equation is solved, each time in coordinates from the last solution, which make the
+#: next one more accurate.
 KALMAN_ROUNDS = 2
 
-#: From so many states on the Riccati equation is solved by doubling first: at 40 states 1 to 2 ms for 12 to 15 ms of
-#: the QZ algorithm.
+#: From so many states on the Riccati equation is solved by doubling first: at 40 states in 1 to 2 ms, compared with 12
+#: to 15 ms by the QZ algorithm.
 DOUBLING_FROM = 40
 
-#: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
+#: A rate for which the equation is not solved at once is approached by this factor, from at most so many steps below.
 RATE_FACTOR = 4.0
 
 MOST_RATE_STEPS = 12
 
-#: Steps are shortened down to this factor.
+#: If a step fails, it is shortened, down to this factor.
 LEAST_FACTOR = 1.2
 
-#: A rate that is asked for is reached by this factor at least, or rounding would decide whether it is.
+#: A required rate is exceeded by at least this factor, so that rounding does not decide whether it is reached.
 WELL_REACHED = 1.001
 
-#: Rates that are tried below the one that is asked for: the first is half of it, where integrators have poles at twice
-#: the rate; then the interval is halved.
+#: Prescribed rates below the required one that are tried: first this share of it, since integrators then have poles at
+#: twice the prescribed rate; then so many bisections.
 FIRST_SHARE, RATE_BISECTIONS = 0.5, 6
 
-#: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
+#: Largest ratio of the noise of the default filter to that of the quietest Kalman filter.
 NOISE_PRICE = 10.0
 
-#: The default rate is found to about this factor.
+#: The default rate is determined up to about this factor.
 RATE_STEP = 1.05
 
-#: Estimates with less than this share of the outputs' noise have none but rounding.
+#: The noise of estimates below this share of the outputs' noise is rounding.
 SILENT = 1e-8
 
-#: Deviations that differ by more than this share from one choice of states to another are rounding.
+#: Deviations that differ by more than this share in different coordinates of the states are rounding.
 SAME_DEVIATION = 0.1
 
-#: A price nearer to the highest than by this share is told by the improved equation.
+#: A noise ratio that is nearer to the largest one than this share is computed from the improved solution.
 NEAR_THE_PRICE = 0.01
 
-#: Halvings of the default rate before the quietest filter is taken as it is.
+#: Number of halvings of the default rate before the quietest filter is used instead.
 MOST_RATE_HALVINGS = 40
 
 
@@ -64,15 +66,18 @@ class KalmanProblem:
 
     F: FloatArray  # (n, n)
     C: FloatArray  # (ny, n)
-    B: FloatArray  # (n, k), for noise that counts, of unit covariance (dt = 0: intensity)
+    B: FloatArray  # (n, k), for the stated noise, of unit covariance (dt = 0: intensity)
     D: FloatArray  # (ny, k)
-    drive: FloatArray  # (n, p): so that the filter stays awake
-    background: FloatArray  # (ny, q): regular where an innovation has no noise
-    estimates: FloatArray  # (k, n): what the noise is counted in, the fault estimates
+    drive: FloatArray  # (n, p): assumed process noise, without which gains of a filter may vanish
+    background: FloatArray  # (ny, q): assumed sensor noise, which makes the covariance of the innovation regular
+    estimates: FloatArray  # (k, n): the fault estimates, whose noise is compared
     dt: float  # s, 0 for continuous time
 
     def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
-        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none."""
+        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` if the equation has no solution.
+
+        If ``persistent``, a rate for which the equation is not solved at once is approached from lower rates.
+        """
         plain = np.eye(self.F.shape[0])
         best, change = self.solved(decay, plain)
         if best is not None or not persistent:
@@ -83,7 +88,7 @@ class KalmanProblem:
             best, change = self.solved(rate, plain)
         factor = RATE_FACTOR
         while best is not None and rate < decay and factor > LEAST_FACTOR:
-            # By shorter steps where one fails: how long a step may be is a matter of rounding.
+            # Steps are shortened if one fails; the possible length depends on rounding.
             further = min(rate * factor, decay)
             gain, moved = self.solved(further, change)
             if gain is None:
@@ -93,10 +98,12 @@ class KalmanProblem:
         return best if rate == decay else None
 
     def quietest_gain(self, decay: float, *, drives: Sequence[float] = (1.0,)) -> FloatArray | None:
-        """Return the gain of the least prescribed rate whose poles all decay at ``decay`` (1/s) or faster; ``None``
-        when the equation has none.  Poles of a rate lie well beyond it, which costs noise.
+        """Return the gain for the least prescribed rate with which all poles decay at ``decay`` (1/s) or faster.
 
-        ``drives``: shares of the drive, the whole first: a filter that is kept awake by less of it may be quieter."""
+        The result is ``None`` if the equation has no solution.  The poles for a prescribed rate usually lie well beyond
+        it, which costs noise.  ``drives`` are shares of the assumed process noise that are tried, one first: with less
+        of it a filter may be quieter.
+        """
         best, noise = self._quietest_of_drive(decay)
         for share in drives[1:] if best is not None and best.size else ():
             gain, less = replace(self, drive=share * self.drive)._quietest_of_drive(decay)
@@ -129,13 +136,14 @@ class KalmanProblem:
     def solved(
         self, decay: float, change: FloatArray, *, only_doubled: bool = False, roughly: bool = False
     ) -> tuple[FloatArray | None, FloatArray]:
-        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one.
+        """Return the gain for a rate, and coordinates (like ``change``) in which its error covariance is the identity.
 
-        ``only_doubled``: of many states, ``None`` rather than the time of the QZ algorithm. ``roughly``: the first gain
-        that reaches the rate, not improved."""
+        With ``only_doubled`` the QZ algorithm, which is slow for many states, is not used: the gain may be ``None``.
+        With ``roughly`` the first gain that reaches the rate is returned, without improvement.
+        """
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
-        # The part of the process noise that the measurements carry is taken out first.
+        # The part of the process noise that is correlated with the measurement noise is eliminated first.
         measured = self.D @ self.D.T + self.background @ self.background.T
         direct = np.linalg.solve(measured, self.D @ self.B.T).T
         free = self.F - direct @ self.C
@@ -144,7 +152,7 @@ class KalmanProblem:
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
 
         def reached(gain: FloatArray) -> bool:
-            # Strictly: a rate that is only met within rounding is none.
+            # The inequality is strict, since a rate that is only reached up to rounding does not count.
             return abscissa(self.F - (gain + direct) @ self.C, self.dt) < bound
 
         best: FloatArray | None = None
@@ -168,7 +176,7 @@ class KalmanProblem:
         direct = np.zeros((self.estimates.shape[0], driving.shape[1]))
         bound = 1.0 if self.dt > 0.0 else 0.0
         if not abscissa(moved, self.dt) < bound:
-            # Stable in some coordinates and not in others: only rounding tells.
+            # Stable in some coordinates and not in others, because of rounding.
             return np.full(len(direct), np.inf)
         covariance = noise_covariance(moved, driving, self.estimates @ change, direct, self.dt, is_stable=True)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
@@ -185,11 +193,11 @@ def _filtered(
     reached: Callable[[FloatArray], bool],
     only_doubled: bool,
 ) -> tuple[FloatArray, FloatArray, bool] | None:
-    """Return the gain of a Kalman filter, states in which its error covariance is the identity, and whether the gain
-    has reached the rate."""
+    """Return the gain of a Kalman filter, coordinates in which its error covariance is the identity, and whether the
+    gain reaches the rate."""
     bound, dt = rate_bound
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
-        # What a badly conditioned equation gives is judged by its poles.
+        # The solution of a badly conditioned equation is judged by the poles.
         try:
             inverse = np.linalg.inv(change)
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
@@ -214,8 +222,10 @@ def _filtered(
 def _solved(
     f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float, *, doubled: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gain and error covariance of a Kalman filter, NaN where the equation is not solved: by doubling, or by the
-    QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    """Return the gain and the error covariance of a Kalman filter, NaN if the equation is not solved.
+
+    The equation is solved by doubling, or by the QZ algorithm, which takes several times as long and rarely fails.
+    """
     if dt > 0.0:
         y = (doubled_solution if doubled else discrete_solution)(f, c, noise, measured, np.zeros((len(f), len(c))))
     else:
@@ -230,23 +240,26 @@ def _solved(
 def compromise(
     problem: KalmanProblem, rate: float, *, like: float | None = None
 ) -> tuple[FloatArray, float, float] | None:
-    """Return the fastest gain ``(n, ny)``, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise; its decay
-    (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate.
+    """Return the fastest gain ``(n, ny)``, up to ``rate`` (1/s), with at most `NOISE_PRICE` times the least noise.
 
-    ``like``: the share of the rate that the plant's gain has with other outputs, near which the search begins."""
+    It is returned with its decay (1/s) and its noise ratio: the largest ratio of the deviation of an estimate to that
+    of the Kalman gain without a prescribed rate.  ``like`` is the decay with other outputs as a share of ``rate``, near
+    which the search begins.
+    """
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
     slow = rate * 2.0**-MOST_RATE_HALVINGS
     while plain is None and slow <= rate:
-        # The quietest filter may be so slow that its equation is lost in rounding: that of some rate is not.
+        # The quietest filter may be so slow that its equation cannot be solved in double precision; then the one with
+        # the least rate for which it can be solved is used.
         plain, change = problem.solved(slow, start)
         slow *= 2.0
     if plain is None:
         return None
-    # Each estimate by itself: they have units of their own.
+    # Ratios are computed for each estimate, since their units differ.
     quietest = problem.deviations(plain, change)
     silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
-    # A deviation that depends on the coordinates it is computed in is rounding, too.
+    # A deviation that depends on the coordinates of its computation is rounding as well.
     again = problem.deviations(plain, start)
     counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
 
@@ -259,14 +272,14 @@ def compromise(
         if gain is None:
             return None
         ratios = problem.deviations(gain, change)[counted] / quietest[counted]
-        # None is quieter than the filter without a rate: what is less is rounding in that one.
+        # No filter is quieter than the one without a rate, so that a ratio below one is rounding.
         price = float(np.max(ratios, initial=1.0))
         if roughly and abs(price - NOISE_PRICE) <= NEAR_THE_PRICE * NOISE_PRICE:
             return attempt(decay, only_doubled=only_doubled, roughly=False)
         return (gain, decay, price) if price <= NOISE_PRICE else None
 
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
-    # The quietest filter is as fast as what is left by itself.
+    # Rates below the decay of the quietest filter need not be tried.
     count = 1
     while count < MOST_RATE_HALVINGS and rate * 2.0**-count > slowest:
         count += 1
@@ -281,7 +294,7 @@ def compromise(
             high = middle
         else:
             best, low = trial, middle
-    # Rates are compared by gains that were not improved, which takes half as long; the one that is taken is.
+    # For many states rates are compared by gains without improvement, in half the time; the final gain is improved.
     return attempt(best[1], roughly=False) or best if many else best
 
 
@@ -293,10 +306,11 @@ def fastest_halving(
     one_by_one: bool,
     like: float | None,
 ) -> tuple[FloatArray, float, float] | None:
-    """Return what the fastest of ``rate, rate / 2, ...`` that is cheap enough comes to; none of ``count`` may be.
+    """Return the result of ``attempt`` for the fastest of ``rate, rate / 2, ...`` (``count`` rates) that has one.
 
-    Of many states the number of halvings is bisected, as noise grows with the rate: high rates, which nearly always
-    are too noisy, take longest, as doubling breaks down there."""
+    Without ``one_by_one``, for many states, the number of halvings is bisected, since noise grows with the rate.  High
+    rates are nearly always too noisy and take the longest, since doubling fails for them.
+    """
     trials: dict[int, tuple[FloatArray, float, float] | None] = {}
 
     def trial(halvings: int) -> tuple[FloatArray, float, float] | None:
@@ -306,7 +320,7 @@ def fastest_halving(
 
     if not one_by_one:
         best = attempt(rate, only_doubled=True)
-        # No fewer halvings than `low` are enough, and `high` are.
+        # Invariant: fewer halvings than `low` do not suffice, and `high` halvings do.
         low, high = 0, 0 if best is not None else count
         near = None if like is None else math.ceil(-math.log2(like))
         while low < high:
@@ -320,5 +334,5 @@ def fastest_halving(
                 near = middle + 1 if further is None else middle - 1
         if best is not None:
             return best
-    # An equation may be lost in rounding at a lower rate than one that is cheap enough.
+    # At lower rates the equation may not be solvable in double precision although it is at some higher rate.
     return next((found for found in map(trial, range(count)) if found is not None), None)

@@ -1,4 +1,4 @@
-"""The checks of a guaranteed test: threshold and witness recomputed from shipped numbers, exactly, without a solver."""
+"""Checks of a guaranteed test: threshold and witness are recomputed exactly from shipped numbers, without a solver."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ from obsynth.verification.claims import listed_gains
 
 SOURCE = "duality of linear programmes; exact arithmetic on the shipped numbers"
 
-#: What certificates hold by programme, as wide as the widest; of a plant with constant matrices one row.
+#: Matrices of a certificate with a row for each linear programme; for a plant with constant matrices, one row.
 BY_PROGRAMME = ("multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "thresholds", "leasts")
 
-#: Sums in another order differ by less than this share.
+#: Relative difference of sums of the same terms in another order, at most.
 SAME_SUM = 1e-12
 
-#: Shares by which an optimum of the linear programmes may miss the proved bounds: ten times the solver's tolerance.
+#: Share by which an optimum of the linear programmes may be beyond the proved bounds: ten times the solver's tolerance.
 TABLE_ROOM = 1e-6
 
-#: Roundings that a product of multipliers and inputs may be away from another.
+#: Difference of two computed products of multipliers and inputs, in units of rounding, at most.
 PRODUCT_ROUNDINGS = 4.0
 
 
@@ -105,7 +105,7 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
 def _problem_of_options(
     design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptions], *, constant: bool
 ) -> tuple[WindowProblem | None, WindowProgrammes | None, str]:
-    """Return the problem that the options state about the plant, and its programmes; or why there are none."""
+    """Return the problem of the options for the plant, and its programmes; or the reason why there are none."""
     try:
         plant: Any = design.linear[0] if constant else design.plant
         options = read(design.options)
@@ -118,7 +118,7 @@ def _problem_of_options(
 
 
 def _placed_row(of_row: NDArray[np.int64], programmes: WindowProgrammes) -> Check:
-    """Return the row that each row of a record has the programme of its own window; -1 is none."""
+    """Return the check that each row of a record has the programme of its own window; -1 stands for none."""
     misplaced = int(np.sum((of_row >= 0) & (of_row != programmes.of_row)))
     return upper_bound_check(
         "rows",
@@ -133,7 +133,7 @@ def _placed_row(of_row: NDArray[np.int64], programmes: WindowProgrammes) -> Chec
 def _shipped_tests(
     shipped: Mapping[str, FloatArray], programmes: WindowProgrammes, used: Sequence[int]
 ) -> dict[int, NearbySolution]:
-    """Return the shipped multipliers of each programme that is used, with their distance from exact ones."""
+    """Return the shipped multipliers of each used programme, with the bounds of their distance from exact ones."""
     tests = {}
     for k in used:
         rows = programmes.windows[k].rows
@@ -142,12 +142,12 @@ def _shipped_tests(
 
 
 def _delay(window: Window, test: NearbySolution) -> int:
-    """Return the samples until a fault that is certain to be detected raises an alarm."""
+    """Return the number of samples until a fault of the size that is certain to be detected raises an alarm."""
     return delay_in_samples(window, window.weights(test.values)[2])
 
 
 def _by_programme(design: ObserverDesign, *, constant: bool) -> dict[str, FloatArray]:
-    """Return the matrices of a certificate, a row for each programme also where there is one alone."""
+    """Return the matrices of a certificate with a row for each programme, also if there is only one."""
     shipped, claims = dict(design.certificate.matrices), design.certificate.claims
     if not constant:
         return shipped
@@ -160,7 +160,7 @@ def _by_programme(design: ObserverDesign, *, constant: bool) -> dict[str, FloatA
 def _what_does_not_fit(
     design: ObserverDesign, shipped: Mapping[str, FloatArray], programmes: WindowProgrammes, *, constant: bool
 ) -> list[str]:
-    """Return the names of matrices that are missing, or are not of the shape and sign of what they stand for."""
+    """Return the names of matrices that are missing, or have a wrong shape or sign."""
     count, windows, plant = len(programmes.windows), programmes.windows, programmes.windows[0].model.plant
     rows, columns = max(window.rows for window in windows), sorted(len(window.inner.bar) for window in windows)
     least = max((shipped[name].shape[-1] for name in ("witness", "witness_radius") if name in shipped), default=1)
@@ -198,7 +198,7 @@ def _what_does_not_fit(
 
 
 def excess(proved: NearbySolution | None, radius: FloatArray) -> float:
-    """Return the largest ratio of what is proved to what is shipped; NaN where nothing is proved."""
+    """Return the largest ratio of a proved radius to the shipped one; NaN without a proof."""
     if proved is None:
         return np.nan
     outside = proved.radius > radius
@@ -206,10 +206,10 @@ def excess(proved: NearbySolution | None, radius: FloatArray) -> float:
 
 
 def _table_fits(design: ObserverDesign) -> bool:
-    """Return whether the thresholds of other numbers of samples do not contradict what is proved of the chosen one.
+    """Return whether the thresholds for other numbers of samples agree with the proofs for the chosen number.
 
-    More samples never raise the least threshold: it is at most the proved one on as many or more, and at least the
-    proved least on as many or fewer.  The rest of the table is what linear programmes say.
+    More samples never raise the least threshold.  It is at most the proved threshold for as many or more samples, and
+    at least the proved lower bound for as many or fewer.  Otherwise the table has the results of linear programmes.
     """
     table, claims = design.certificate.matrices.get("trade_off"), design.certificate.claims
     if table is None:
@@ -225,15 +225,16 @@ def _table_fits(design: ObserverDesign) -> bool:
 
 
 def _worst(value: float) -> float:
-    """Return a number that every comparison takes into account: what is not known is infinite."""
+    """Return a number, or infinity for NaN, which comparisons would ignore."""
     return np.inf if np.isnan(value) else float(value)
 
 
 def _judged(
     window: Window, test: NearbySolution, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
 ) -> tuple[float, float, float, float]:
-    """Return of one test how far exact multipliers are away beside what is shipped, by what the threshold that is
-    proved passes its own, the threshold itself, and the rounding error beside the shipped one."""
+    """Return four numbers on one test: the distance of exact multipliers relative to the shipped bound, the ratio of
+    the proved threshold to the shipped one if it is larger, the threshold, and the rounding error relative to the
+    shipped one."""
     claimed = float(shipped["thresholds"][k, 0])
     zero = claimed == 0.0
     examined = window.outer if zero else window
@@ -307,7 +308,7 @@ def _of_the_tests(
 
 
 def _moving(window: Window) -> str:
-    """Return what the threshold assumes of disturbances beside their bounds, to be added to its row."""
+    """Return a text on the assumptions on disturbances other than their bounds, to be added to the row."""
     words = disturbances_in_words(window)
     return f", for {words}" if words else ""
 
@@ -326,13 +327,13 @@ def _of_what_runs(
     room = np.array([[known_room(*pair)] for pair in zip(windows, multipliers, strict=True)])
     if isinstance(problem.plant, DescriptorSystem):
         observer, tracking = design.linear[1], shipped.get("state_tracking")
-        # The observer beside the test may be any: its error is bounded by what it is.
+        # No condition on the observer beside the test: its error is bounded from its own numbers.
         beside = None if tracking is None else part_beside(observer, min(len(tracking), observer.order))
         implied, rooms = observer_of(windows[0], multipliers[0], beside), {"Bu": room, "Du": room}
         gains = dict(zip("hg", windows[0].weights(multipliers[0])[:2], strict=True))
     elif isinstance(design.observer, WindowObserver):
         has_test = np.isin(np.arange(len(windows)), list(tests))
-        # Rows whose programme has a test may be left without a verdict.
+        # A row may be without a verdict although its programme has a test.
         of_row = shipped["programmes"].ravel()
         implied = replace(observer_of_rows(problem, programmes, has_test, multipliers), programmes=of_row)
         rooms, gains = {"weights": room}, {"weights": design.observer.weights}
@@ -367,7 +368,7 @@ def _over_tolerances(design: ObserverDesign, window: Window, test: NearbySolutio
 
 
 def known_room(window: Window, multipliers: FloatArray) -> float:
-    """Return how far weights of known inputs may be from those that the multipliers say, by the order of sums."""
+    """Return a bound on the rounding of the weights of known inputs, which are sums over the multipliers."""
     nx, ne, _, ny = window.model.sizes
     equations = np.abs(multipliers[: window.outputs_at]).reshape(window.equations, ne)
     outputs = np.abs(multipliers[window.outputs_at :][: window.test_problem.samples * ny])
@@ -378,7 +379,10 @@ def known_room(window: Window, multipliers: FloatArray) -> float:
 
 
 def _misfit(shipped: object, implied: Any, rooms: Mapping[str, FloatArray]) -> float:
-    """Return the largest difference of two observers as a share of the room of each number; infinite where none is."""
+    """Return the largest difference between two observers relative to the tolerance of each number.
+
+    It is infinite for a difference without a tolerance.
+    """
     worst = 0.0
     for part in fields(implied):
         name, implied_part, shipped_part = part.name, getattr(implied, part.name), getattr(shipped, part.name)
@@ -397,8 +401,11 @@ def _misfit(shipped: object, implied: Any, rooms: Mapping[str, FloatArray]) -> f
 def _proved_witness(
     window: Window, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
 ) -> tuple[float, float]:
-    """Return how far an exact point is away beside what is shipped, and the size that the witness proves; NaN for
-    less than what is shipped as the row's own.  Of a test alone the claim itself is below."""
+    """Return the distance of an exact point relative to the shipped bound, and the size that the witness proves.
+
+    With several programmes, the size is NaN if it is below the shipped one of this row; with one programme the claim
+    itself is compared later.
+    """
     window = window.inner
     columns, size = len(window.bar), float(shipped["leasts"][k, 0])
     if "witness" not in shipped or shipped["witness"].shape[1] < columns:
@@ -412,7 +419,7 @@ def _proved_witness(
 def _is_lasting(
     problem: WindowProblem, programmes: WindowProgrammes, shipped: Mapping[str, FloatArray], k: int
 ) -> bool:
-    """Whether the shipped witness of a programme is a course of a plant that runs before and after the window."""
+    """Whether the shipped witness of a programme is a trajectory of a plant that runs before and after the window."""
     window = programmes.windows[k].inner
     columns = len(window.bar)
     if "witness" not in shipped or shipped["witness"].shape[1] < columns:
@@ -434,7 +441,7 @@ def _of_the_least(
     threshold, least = float(claims.get("threshold", np.nan)), claims.get("least")
     if least is None:
         return
-    # Where the least is zero there is nothing to show.
+    # A lower bound of zero needs no witness.
     with_witness = [k for k in used if not np.isnan(shipped["leasts"][k, 0]) and shipped["leasts"][k, 0] != 0.0]
     proofs = [_proved_witness(programmes.windows[k], shipped, k, constant=constant) for k in with_witness]
     away = max((_worst(distance) for distance, _ in proofs), default=0.0)

@@ -1,4 +1,4 @@
-"""A linear observer on a log, row by row: gaps, bad rows, warm-up."""
+"""A linear observer on a log, row by row, with gaps, bad rows and the warm-up."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
-#: What is guaranteed waits until what a gap has left is below this share of that, for so many initial-condition
-#: responses at most.
+#: Guaranteed bounds are suspended after a gap until its effect is below this share of the usual changes, but at most
+#: for so many durations of the initial-condition response.
 GUARANTEED_SHARE, MOST_TRANSIENTS = 1e-3, 10
 
 SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing rows follow from the time stamps."
 
-#: Steps after a gap that are followed together.
+#: Number of steps after a gap whose effects are computed together.
 STEPS_AT_ONCE = 256
 
-#: What goes from row to row.
+#: Attributes that form the state between rows.
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
     *("moves", "reach"),
@@ -43,7 +43,7 @@ _Part = TypeVar("_Part")
 
 
 def _running(part: _Part | None) -> _Part:
-    """Return a part that is there while the observer runs."""
+    """Return a part of the state, which exists while the observer runs."""
     if part is None:
         raise ObsynthError(
             "The saved state is incomplete: its observer or plant model is missing. Start the run again."
@@ -78,24 +78,24 @@ class LinearLogObserver(LogObserver):
         self.v = np.zeros(self.b.shape[1])
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
-        # What is known of the plant's states at the last measured row, from which the model starts.
+        # Estimates of the plant's states at the last measured row, from which the model starts in a gap.
         self.seen = np.full(missing.known_states, np.nan)
-        # Since when nothing is left of a gap: bounds that are never passed hold from there on.
+        # Time from which on a gap has no effect, so that guaranteed bounds are valid; whether a run has begun before.
         self.clear_at, self.begun = -math.inf, False
-        # Since when the initial-condition response has settled, and whether the model has stood in for all that was
-        # missing from there on.
+        # Time from which on the initial-condition response has settled; whether the model has since then predicted all
+        # missing values.
         self.known_from, self.bridged = math.inf, False
-        # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
+        # Sums of squared changes of fault estimates and residuals from row to row, and the number of these changes.
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
-        # What a unit error of each input that was held, and of each output that the model told, has left in z.
+        # Effect on z of a unit error of each held input and of each output that the model predicted; the held inputs.
         self.gap_error, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
-        # How inputs have moved, and how far those that are missing may have moved since they were known.
+        # History of the changes of inputs; bounds on the changes of missing inputs since they were measured.
         self.moves, self.reach = no_inputs(self.nu), np.zeros(self.nu)
-        # What the errors of the last gap have left in z, and what those of the gaps before it had in the columns.
+        # Effect of the errors of the last gap on z, and of those of earlier gaps on the columns.
         self.excess, self.carried = np.zeros(self.b.shape), np.zeros(len(self.columns))
         self.transient = transient(self.observer)
-        # Of every fault of the plant; those of which nothing is estimated are held to be absent.
+        # All faults of the plant; those without an estimate are assumed to be zero.
         self.fault = np.zeros(self.plant.nf)
         self.estimated_faults = missing.estimated_faults
         self.measured = self.v
@@ -103,7 +103,8 @@ class LinearLogObserver(LogObserver):
         self.inputs = np.zeros((0, self.nu))
 
     def _usual(self) -> FloatArray | None:
-        """Return what a gap may have left in fault estimates and residuals; nothing where that is not known yet."""
+        """Return the effect of a gap on fault estimates and residuals that counts as usual; ``None`` if it is not known
+        yet."""
         enough = self.counted >= LEAST_SHOWN
         if not enough and not self.noise.all():
             return None
@@ -117,7 +118,7 @@ class LinearLogObserver(LogObserver):
         previous = self.row if self.model is None and self.z is not None else None
         u = values[: self.nu]
         u = np.where(np.isfinite(u), u, self.v[: self.nu])
-        # A number that overflows in what follows is a bad sample like any other: the state is looked at below.
+        # A sample that makes numbers overflow is a bad sample: the state is checked below.
         with np.errstate(over="ignore", invalid="ignore"):
             if missing:
                 self._bridge_interval(seconds, missing, u)
@@ -126,7 +127,7 @@ class LinearLogObserver(LogObserver):
             if good and self.model is not None:
                 self._propagate(seconds, u)
                 recovered, unsure = self._recovering(seconds, values, longest)
-                # What has become usual before a new start would have settled needs none.
+                # The observer starts again if the model has lost the plant and a new start settles sooner.
                 if recovered >= self.warm_up and self._lost(values):
                     self._restart()
             first = self.z is None
@@ -146,8 +147,8 @@ class LinearLogObserver(LogObserver):
                 estimates = self._measured(seconds, values)
                 if self.model is not None:
                     self.model, self.gap_error, self.reach = None, np.zeros_like(self.gap_error), np.zeros(self.nu)
-                    # The initial-condition response settles in as many measured rows as without a gap: what the gap
-                    # adds is no larger than what is left of the start then, and goes with it.
+                    # The initial-condition response settles in as many measured rows as without a gap.  The effect of
+                    # the gap is no larger than the rest of that response, and decays with it.
                     self.settled_at += since * missing / (missing + 1)
                     if self.phase != WARM_UP or time >= self.settled_at:
                         self.settled_at, self.phase = self._after(time, recovered), RECOVERING
@@ -162,7 +163,8 @@ class LinearLogObserver(LogObserver):
             self._restart()
             return Row(GAP, self._held(), missing)
         self.fault = self._faults_in(estimates)
-        # Until enough is known of what is usual, rows after a gap tell it, too: others may never come.
+        # Rows after a gap are used to estimate the usual changes as long as there are too few others, which may never
+        # come.
         counts = status == OK or (status == RECOVERING and self.counted < LEAST_SHOWN)
         if previous is not None and counts and not missing:
             self._count((estimates - previous)[None])
@@ -179,7 +181,7 @@ class LinearLogObserver(LogObserver):
         *,
         clear: bool = False,
     ) -> Row:
-        """Return a complete row; ``clear`` where it is known that gaps have left nothing."""
+        """Return a complete row; ``clear``: gaps are known to have no effect on it."""
         settled = time >= self.clear_at
         self.bridged |= settled and time >= self.known_from
         return Row(
@@ -187,7 +189,7 @@ class LinearLogObserver(LogObserver):
         )
 
     def _excess_in(self, status: str) -> FloatArray | None:
-        """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
+        """Return a bound of the effect of gaps on the columns of a complete row; ``None`` unless it is recovering."""
         if status != RECOVERING:
             self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
             return None
@@ -200,13 +202,13 @@ class LinearLogObserver(LogObserver):
         return np.asarray(self.carried + np.abs(self.observer.Cz @ self.excess).sum(axis=1))
 
     def _advance_excess(self, seconds: float) -> None:
-        """Bring what a gap has left in a continuous observer to this row; in a sampled one it is there already."""
+        """Propagate the effect of a gap in a continuous observer to this row; a sampled one has done so already."""
         if self.observer.dt == 0.0 and seconds > 0.0 and self.excess.any():
             self.excess = self._hold(seconds)[0] @ self.excess
 
     @property
     def takes_pieces(self) -> bool:
-        """Whether the observer runs, and no model stands in for missing samples."""
+        """Whether the observer runs without the model for missing samples, so that rows can be taken together."""
         return self.z is not None and self.model is None
 
     def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
@@ -214,7 +216,7 @@ class LinearLogObserver(LogObserver):
         count, observer = len(intervals), self.observer
         z, before, sampled = _running(self.z), self.v, observer.dt > 0.0
         states, rows = np.empty((count, observer.order)), np.empty((count, len(observer.Cz)))
-        # The products of `step`, in the same order: results do not depend on where a piece ends.
+        # The same products as in `step`, in the same order, so that results do not depend on where a piece ends.
         with np.errstate(over="ignore", invalid="ignore"):
             for k, v in enumerate(values[:count]):
                 if not sampled:
@@ -270,28 +272,28 @@ class LinearLogObserver(LogObserver):
         return np.asarray(self.solver @ np.concatenate([z, outputs]))
 
     def _faults_in(self, row: FloatArray) -> FloatArray:
-        """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
+        """Return all faults of the plant ``(nf,)`` from a row of estimates."""
         faults = np.zeros(len(self.fault))
         faults[self.estimated_faults] = row[self.observer.fault_rows]
         return faults
 
     def _count(self, changes: FloatArray) -> None:
-        """Sum up changes ``(n, rows)``, one after the other, so that results do not depend on pieces."""
+        """Add the squares of changes ``(n, rows)`` one after another, so that results do not depend on pieces."""
         with np.errstate(over="ignore"):
             squares = np.nan_to_num(changes[:, self.shown] ** 2, nan=0.0, posinf=0.0)
         self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
         self.counted += len(changes)
 
     def _recovering(self, seconds: float, v: FloatArray, longest: float) -> tuple[float, float]:
-        """Return the seconds after a gap in which nothing may be decided, and those in which nothing is guaranteed; the
-        model stands at this row already.
+        """Return the seconds after a gap in which rows are not decided, and those in which nothing is guaranteed.
 
-        The outputs of the model missed those of the plant by no more during the gap than they do now, as errors of a
-        model grow: what that can have left in fault estimates and residuals is followed until it is usual.
+        The model has been propagated to this row.  Its errors grow during a gap, so that the present errors of its
+        outputs are taken as bounds for the whole gap.  Their effect on fault estimates and residuals is computed until
+        it is as small as usual changes.
         """
         gap_model, nu = _running(self.gap_model), self.nu
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
-        # An input that was held was off by no more than it has changed since, or may have by how it moved before.
+        # The error of a held input is at most its change since then, or a bound from its earlier changes.
         missed = np.concatenate([np.maximum(np.abs(v[:nu] - self.held), self.reach), missed])
         usual, step = self._usual(), self.observer.dt or longest
         if not (np.isfinite(self.gap_error).all() and step > 0.0):
@@ -310,7 +312,7 @@ class LinearLogObserver(LogObserver):
         most = max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0)
         waited, recovered = 0.0, self.warm_up
         for effects in _effects_by_step(self.observer.Cz[self.shown], a, remaining, missed):
-            # One after the other, as C adds them.
+            # Added one after another, as in the C code.
             times = np.cumsum(np.concatenate([[waited], np.full(len(effects), step)]))
             within = np.count_nonzero(times[:-1] < most)
             quiet = np.flatnonzero((effects[:within] <= GUARANTEED_SHARE * usual).all(axis=1))
@@ -324,12 +326,11 @@ class LinearLogObserver(LogObserver):
         return recovered, waited
 
     def _lost(self, v: FloatArray) -> bool:
-        """Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size
-        before and after it."""
+        """Whether the model's error in the outputs after a gap exceeds the sum of their sizes before and after it."""
         gap_model = _running(self.gap_model)
         if not self.gap_error[:, self.nu :].any():
             return False
-        # The outputs and the model may both be huge; a miss that is not finite is lost as well.
+        # An error that is not finite counts as lost as well.
         return not gap_model.miss(v, self.model, self.fault) <= gap_model.miss(self.measured) + gap_model.miss(v)
 
     def _taken(self, v: FloatArray) -> None:
@@ -339,14 +340,13 @@ class LinearLogObserver(LogObserver):
         self.inputs = np.vstack([self.inputs, v[: self.nu]])[-self.kept_inputs :]
 
     def _flow(self, seconds: float, v: FloatArray) -> None:
-        """Bring z of a continuous observer to the time of ``v``, which is reached along a straight line."""
+        """Propagate z of a continuous observer to the time of ``v``; its inputs are straight lines in between."""
         if seconds > 0.0:
             transition, constant, ramp = self._hold(seconds)
             self.z = np.asarray(transition @ _running(self.z) + constant @ self.v + ramp @ (v - self.v))
 
     def _bridge_interval(self, seconds: float, missing: int, u: FloatArray) -> None:
-        """Cross the rows that are not there, in continuous time up to and including this row's time; start again where
-        they are too many."""
+        """Propagate over missing rows, in continuous time up to this row's time; start again if they are too many."""
         if self.z is None:
             return
         if missing > LONGEST_BRIDGE:
@@ -359,8 +359,10 @@ class LinearLogObserver(LogObserver):
             self._unmeasured(part, begin + (u - begin) * share, nothing)
 
     def _unmeasured(self, seconds: float, u: FloatArray, values: FloatArray) -> FloatArray:
-        """Let the plant model stand in for what is missing in ``values (nu + ny,)`` of one sample; return the
-        estimates, faults held. ``u (nu,)``: the inputs, held where they are not known."""
+        """Take one sample whose missing ``values (nu + ny,)`` the plant model predicts, and return the estimates.
+
+        Fault estimates are held.  ``u (nu,)`` are the inputs, held where they are missing.
+        """
         if self.z is None:
             return self._held()
         if self.gap_model is None:
@@ -374,7 +376,7 @@ class LinearLogObserver(LogObserver):
                 self._propagate(seconds, u)
         else:
             self._propagate(seconds, u)
-        # What is measured is taken; what is not, the model says.
+        # Measured values are used; the model predicts the others.
         from_model = ~np.isfinite(values)
         self.bridged &= not from_model[: self.nu].any()
         v = np.where(from_model, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
@@ -395,11 +397,12 @@ class LinearLogObserver(LogObserver):
         return row
 
     def _unknown_inputs(self, u: FloatArray) -> None:
-        """Follow how far inputs may have moved that are missing (NaN in ``u (nu,)``)."""
+        """Update the bounds on the changes of missing inputs (NaN in ``u (nu,)``)."""
         before, taken = self.v[: self.nu], taken_inputs(self.moves, self.v[: self.nu], u, is_first=False)
         lowest, highest, change, count, _ = taken.history
         returned = np.where((count == 0.0) & (self.moves[3] > 0.0), np.abs(taken.u - before), 0.0)
-        # In one sample an input is off by what it has changed since; in several it may have come and gone.
+        # After one missing sample the error of an input is its change since then; after several, the input may have
+        # changed and returned.
         moved = np.where(count > 1.0, np.minimum(count * change, highest - lowest), returned)
         self.moves, self.reach = taken.history, np.maximum(self.reach, moved)
 
@@ -428,8 +431,11 @@ class LinearLogObserver(LogObserver):
 def _effects_by_step(
     rows: FloatArray, a: FloatArray, remaining: FloatArray, missed: FloatArray
 ) -> Iterator[FloatArray]:
-    """Yield what is left in each row of what was missed, for steps one after the other ``(steps, rows)``: the first one
-    by one, then many at a time, as modes of an observer may be so slow that there are tens of thousands."""
+    """Yield bounds of the effect of errors during a gap on each row, for consecutive steps ``(steps, rows)``.
+
+    The first steps are yielded one by one, later ones in groups, since slow modes of an observer may need tens of
+    thousands.
+    """
     for _ in range(STEPS_AT_ONCE):
         remaining = a @ remaining
         yield (np.abs(rows @ remaining) @ missed)[None]
