@@ -46,6 +46,10 @@ class OperatingPointCheck:
             self._sum[finite] += row[finite]
             self._count[finite] += 1.0
 
+    def log_until(self, time: float) -> tuple[float, FloatArray]:
+        """Return how many seconds are between the first row and a time, and the deviations of the first row."""
+        return time - (time if self._begin is None else self._begin), self._start
+
     def alarm_of_the_start(
         self, design: ObserverDesign, alarms: Sequence[AlarmEvent], *, warm_up: float
     ) -> tuple[str, ...]:

@@ -19,8 +19,9 @@ from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.monitoring.alarms.events import AlarmEvent, rows_in_alarm
 from obsynth.monitoring.logs.clock import STALE
 from obsynth.monitoring.logs.followed import FollowedLog
-from obsynth.monitoring.logs.log_observer import GAP
+from obsynth.monitoring.logs.log_observer import GAP, WARM_UP
 from obsynth.monitoring.logs.log_run import LogRun
+from obsynth.monitoring.logs.long_warm_up import LONG_SHARE, advice_on_warm_up, cause_of_warm_up
 from obsynth.monitoring.logs.measured_columns import never_measured
 from obsynth.monitoring.logs.saved_run import resume_state, save_state
 from obsynth.monitoring.logs.signals import TIME_HEADER
@@ -35,6 +36,7 @@ from obsynth.numerics.arguments import arguments_checked, require_kind, whole_nu
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.results.number_texts import duration
 from obsynth.results.registered import registered
 
 if TYPE_CHECKING:
@@ -370,6 +372,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
             *run.first.warnings(),
             *stamps.measured.notes(run.signals.columns_and_signals(), run.signals.inputs),
             *start,
+            *(() if resumed else _long_warm_up(run, design)),
             *stuck_texts(stuck),
             *(() if run.beyond is None else run.beyond.texts(run.rows)),
             *run.taken_for_usual(),
@@ -382,6 +385,22 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
         silent=dict(run.events.silent),
         warm_up=run.observer.warm_up,
         stuck=stuck,
+    )
+
+
+def _long_warm_up(run: LogRun, design: ObserverDesign) -> tuple[str, ...]:
+    """Return a text where most of the rows that could have been decided are warm-up."""
+    rows = run.events.silent[WARM_UP]
+    if not rows or rows < LONG_SHARE * run.rows:
+        return ()
+    cause = cause_of_warm_up(run.observer)
+    if not cause:
+        return ()
+    guarantees = run.monitor is not None and run.monitor.guarantees
+    advice = "" if guarantees else advice_on_warm_up(design, run.observer, [run.first.log_until(run.clock.stamp)])
+    return (
+        f"{rows} of {run.rows} rows have no decision, as the warm-up lasts {duration(run.observer.warm_up)}: {cause}. "
+        f"{advice or 'Longer logs have decisions.'}",
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.logs.long_warm_up import LONG_SHARE, advice_on_warm_up, cause_of_warm_up
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.sources import Logs
 from obsynth.monitoring.thresholds.alarm_rates import rows_per_alarm
@@ -195,14 +196,19 @@ def learn_thresholds(
 def _long_warm_up(runs: NormalRuns, logs: NormalLogs) -> str:
     """Return how much of the logs is warm-up, as a sentence with a blank before it; empty where it is less than half
     of them."""
-    warm_up = runs.begun().observer.warm_up
-    rows = sum(int(np.sum(times - times[0] < warm_up)) for times in (logs.rows[a:b, 0] for a, b in logs.ends if a < b))
-    if 2 * rows < len(logs.rows):
+    run = runs.begun()
+    warm_up = run.observer.warm_up
+    parts = [logs.rows[a:b] for a, b in logs.ends if a < b]
+    rows = sum(int(np.sum(part[:, 0] - part[0, 0] < warm_up)) for part in parts)
+    if rows < LONG_SHARE * len(logs.rows):
         return ""
+    cause = cause_of_warm_up(run.observer)
+    spans = [(float(part[-1, 0] - part[0, 0]), run.signals.deviations(part[:1])[0]) for part in parts]
+    advice = advice_on_warm_up(runs.design, run.observer, spans) if cause else ""
     return (
         f" {rows} of the {len(logs.rows)} rows are warm-up: this lasts {duration(warm_up)} from the start of each log"
-        f"{'' if runs.warm_up is not None else ', until the slowest mode of the observer has shrunk to 2 %'}. Give "
-        "longer logs, or a shorter warm-up (--warm-up) where logs begin near the operating point of the design."
+        f"{f', {cause}' if cause else ''}. Give longer logs, or a shorter warm-up (--warm-up) where logs begin near "
+        f"the operating point of the design.{f' {advice}' if advice else ''}"
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.spectra import abscissa, eigenvalues, speeds
 from obsynth.observers.linear.observer import LinearObserver
@@ -17,6 +18,10 @@ STATES_FOR_ALL_MODES = 200
 
 #: The initial-condition response has settled when its slowest mode has decayed to this share.
 SETTLED_TO = 0.02
+
+#: Steps in which an initial-condition response is followed: when it has settled is known to a thousandth of the
+#: settling time of the slowest mode, more than is printed.
+REST_STEPS = 1000
 
 #: Waiting for that ends with a sample that rounding, of this share of dt, calls earlier.
 SETTLING_SLACK = 1e-6
@@ -82,6 +87,41 @@ def _steps_remembered(Az: FloatArray) -> int:
     while reached.any():
         reached, steps = np.asarray(passes @ reached), steps + 1
     return steps
+
+
+def settling_from_rest(observer: LinearObserver, v: FloatArray, deviations: FloatArray) -> float:
+    """Return after how many seconds fault estimates and residuals of an observer that starts at zero are as if it had
+    started at rest.
+
+    Where inputs and outputs ``v (nu + ny,)`` are constant, the difference is the response to that initial condition: it
+    has settled when it is, in every row, below ``deviations (rows,)`` of noise, or below `SETTLED_TO` of its largest
+    value.  Infinite where the observer has no state of rest.
+    """
+    rows = observer.Cz[len(observer.state_names) :]
+    late = observer.dt * max((*observer.state_delays, *observer.fault_delays), default=0)
+    if not (observer.order and len(rows)):
+        return late
+    at_rest = np.eye(observer.order) * (observer.dt > 0.0) - observer.Az
+    try:
+        z = np.linalg.solve(at_rest, np.hstack([observer.Bu, observer.By]) @ v)
+    except np.linalg.LinAlgError:
+        return math.inf
+    longest = settling_of_modes(observer)
+    if not (np.isfinite(z).all() and math.isfinite(longest)):
+        return math.inf
+    step = longest / REST_STEPS
+    if observer.dt > 0.0:
+        samples = max(1, math.ceil(step / observer.dt))
+        step, transition = samples * observer.dt, np.linalg.matrix_power(observer.Az, samples)
+    else:
+        transition = first_order_hold(observer.Az, np.zeros((observer.order, 1)), step)[0]
+    responses = [rows @ z]
+    for _ in range(REST_STEPS):
+        z = transition @ z
+        responses.append(rows @ z)
+    sizes = np.abs(responses)
+    over = (sizes > np.maximum(deviations, SETTLED_TO * sizes.max(axis=0))).any(axis=1)
+    return late + step * (int(np.flatnonzero(over)[-1]) + 1 if over.any() else 0)
 
 
 def noise_variances(observer: LinearObserver, noise: FloatArray) -> FloatArray:
