@@ -351,7 +351,7 @@ def _design(
         worst = worst_sum(effect if moving else held(effect), weights, plant.noise)
         if worst > float(found.group(1)) * (1.0 + 1e-3):
             sentences.refute("threshold of a test", f"{found.group(1)}, reached {worst:.6g}")
-        sure = re.search(rf"A fault of {NUMBER} is certain to raise an alarm", told)
+        sure = re.search(rf"A fault of {NUMBER} with this course, from a sample on, is certain to raise an alarm", told)
         if sure is not None:
             sentences.expect("size that is sure to alarm", whole, EXACT)
             if float(sure.group(1)) * (1.0 + 1e-3) < worst + float(found.group(1)):

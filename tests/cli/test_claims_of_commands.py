@@ -62,7 +62,7 @@ TABLE: dict[str, tuple[list[str], str, tuple[str, ...]]] = {
     ),
     "design, a gain": (
         ["design", "--system", str(FILTER), "--output", "filter.json", "--quiet"],
-        r"gamma = [0-9.]+, proved bound", ("the model is exact, disturbances held over each sample",),
+        r"gamma = [0-9.]+, proved bound", ("the model is exact, all signals held over each sample",),
     ),
     "design, a gain of a plant that was sampled by its paper": (
         ["design", "--system", str(PAPER), "--output", "paper.json", "--quiet"],
@@ -266,7 +266,7 @@ def test_a_page_and_a_proof_say_for_what_gains_hold(tmp_path: Path, capsys: pyte
     gains, page, proof = (tmp_path / name for name in ("filter.json", "page.html", "proof.json"))
     design.save(gains)
     assert main(["report", "--gains", str(gains), "--out", str(page)]) == 0
-    assert "the model is exact, disturbances held over each sample" in page.read_text("utf-8")
+    assert "the model is exact, all signals held over each sample" in page.read_text("utf-8")
     assert main(["export", "--gains", str(gains), "--to", str(proof), "--checker"]) == 0
     capsys.readouterr()
     told = subprocess.run(

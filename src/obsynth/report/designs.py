@@ -220,7 +220,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
         return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
     if gains is None or not isinstance(plant, DescriptorSystem):
-        return ("parameter", f"deviation {deviation_time(plant)}"), [
+        return ("parameter", f"deviation {deviation_time(design)}"), [
             (name, deviation(name, "-")) for name in observer.fault_names
         ]
     linear = design.linear[1]
@@ -243,9 +243,14 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
     return ("fault", *delays, noise, *(("largest gain",) if plant.nd else ())), rows
 
 
-def deviation_time(plant: Any) -> str:
+def deviation_time(design: ObserverDesign) -> str:
     """Return when the deviation of a recursive observer is that of its report."""
-    return "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
+    if isinstance(design.plant, DAEModel):
+        return "after the nominal run"
+    steps = design.certificate.claims.get("steps", math.nan)
+    if getattr(design.plant, "horizon", None) is not None or not math.isfinite(steps):
+        return "at the end of the horizon"
+    return f"after {steps:,.0f} samples without a change"
 
 
 def estimate_figures(design: ObserverDesign, gains: FaultGains | None) -> Iterator[dict[str, Any]]:
@@ -273,11 +278,27 @@ def is_of_held_disturbances(design: ObserverDesign) -> bool:
     """Return whether gains or decoupling are claimed of a sampled plant whose disturbances may move between samples.
 
     A guaranteed test says itself which disturbances it is for."""
-    plant, written = design.plant, None if design.source is None else design.source.plant
+    plant = design.plant
     if not isinstance(plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver) or not plant.nd:
         return False
-    sampled = isinstance(written, DescriptorSystem) and written.dt == 0.0 < plant.dt
+    sampled = _is_sampled(design)
     return not is_guaranteed(design) and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
+
+
+def held_signals(design: ObserverDesign) -> str:
+    """Return which signals every claim of a linear design takes as held between the samples of its plant, if any: a
+    fault that begins within a sample is estimated as another one at first."""
+    if _is_sampled(design):
+        return "all signals"
+    return "disturbances" if is_of_held_disturbances(design) else ""
+
+
+def _is_sampled(design: ObserverDesign) -> bool:
+    """Return whether a design is for the samples of a continuous plant that it names."""
+    plant, written = design.plant, None if design.source is None else design.source.plant
+    if not isinstance(plant, DescriptorSystem) or not isinstance(written, DescriptorSystem):
+        return False
+    return written.dt == 0.0 < plant.dt
 
 
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:

@@ -102,8 +102,8 @@ def _of_test(test: GuaranteedTest) -> Iterator[str]:
     soon = f", at the latest after {duration(claims['delay'])}" if "delay" in claims else ""
     sure = claims.get("surely_found", 2.0 * test.threshold)
     yield (
-        f"{test.fault}: {_bound(sure, unit)} is certain to be detected{soon}; no false alarm while disturbances and "
-        "noise keep their bounds (proved)."
+        f"{test.fault}: {_bound(sure, unit)} is certain to be detected{soon} (with the course of the "
+        "test, from a sample on); no false alarm while disturbances and noise keep their bounds (proved)."
     )
 
 
@@ -116,7 +116,7 @@ def _of_estimates(design: ObserverDesign, interval: float | None) -> Iterator[st
     units = design.plant.units
     timed = not isinstance(observer, LinearObserver) or observer.dt > 0.0
     # Until its gain has settled an estimate has the deviation of the prior, and where the plant moves, another one.
-    when = "" if isinstance(observer, LinearObserver) else f" as they are {deviation_time(design.plant)}"
+    when = "" if isinstance(observer, LinearObserver) else f" as they are {deviation_time(design)}"
     held = ", if it is held between samples" if is_of_held_disturbances(design) else ""
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""

@@ -40,7 +40,7 @@ from obsynth.report.designs import (
     fault_estimates,
     followed_steps,
     gains_if_linear,
-    is_of_held_disturbances,
+    held_signals,
     unproved,
 )
 from obsynth.report.plants import plain_table
@@ -301,7 +301,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        held = ", disturbances held over each sample" if is_of_held_disturbances(design) else ""
+        held = f", {signals} held over each sample" if (signals := held_signals(design)) else ""
         # Of a continuous design with known inputs a threshold over tolerances takes inputs as held between rows, which
         # must be asked for.
         is_asked = design.plant.nu and not design.plant.is_discrete

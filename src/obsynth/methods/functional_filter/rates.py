@@ -268,9 +268,9 @@ class DelayCurve:
 
     @property
     def title(self) -> str:
-        """What the deviations are of, and their unit."""
+        """What the deviations are of, and their unit: of the Kalman filter of each walk, whatever the design is."""
         unit = f" ({self.unit})" if self.unit else ""
-        return f"Standard deviation of the estimate of {self.fault}{unit} against its delay in samples"
+        return f"Least standard deviation of an estimate of {self.fault}{unit} that walks, by its delay in samples"
 
     @property
     def sentence(self) -> str:

@@ -160,7 +160,7 @@ class GuaranteedTestMethod(TestOptions, Method):
         ),
         "surely_found": ClaimMeaning(
             "",
-            "a fault of this size and course is certain to alarm, on the nominal plant",
+            "a fault of this size and course, from a sample on, is certain to alarm, on the nominal plant",
             "surely found",
             side="at most",
         ),

@@ -357,7 +357,8 @@ def _notes(
             f"The threshold is {upper_text(threshold)}; none with {counted(test_problem.samples, 'sample')} is below "
             f"{lower_text(least)} (proved{f', for {kind}' if kind else ''}). "
             + (
-                f"A fault of {upper_text(2.0 * threshold)} is certain to raise an alarm."
+                f"A fault of {upper_text(2.0 * threshold)} with this course, from a sample on, is certain to raise an "
+                "alarm."
                 if mean is None
                 else f"This is for the nominal plant: over the tolerances it is {mean:.4g} in the mean of the scenario."
             )

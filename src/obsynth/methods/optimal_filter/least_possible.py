@@ -57,6 +57,7 @@ class LeastPossible(NamedTuple):
     delay: tuple[int, ...] | None
     later_gain: float
     is_noise_stated: bool = True
+    is_decoupled: bool = False
 
     @property
     def gain_share(self) -> float:
@@ -71,14 +72,17 @@ class LeastPossible(NamedTuple):
     def sentence(self) -> str:
         """Return both in one line, for who reads the design."""
         said = []
+        alike = "with its response to the faults" if self.delay is None else _with_delay(self.delay)
         if self.gain or self.least_gain:
-            alike = "with its response to the faults" if self.delay is None else _with_delay(self.delay)
             least, later = (_in_words(gain, self.gain) for gain in (self.least_gain, self.later_gain))
             said.append(f"gain {self.gain:.5g}; least of any causal filter {alike}: {least}")
             said += [] if np.isnan(self.later_gain) else [f"with one sample more: {later}"]
         if np.isfinite(self.deviation_share):
             assumed = "" if self.is_noise_stated else ", if it is equal on every output (none is stated)"
-            said.append(f"noise {self.deviation_share:.3g} times the least possible{assumed}")
+            others = (
+                alike if said else f"of any causal filter {alike}{', decoupled as it is' if self.is_decoupled else ''}"
+            )
+            said.append(f"noise {self.deviation_share:.3g} times the least {others}{assumed}")
         return "; ".join(said)
 
 
@@ -127,6 +131,7 @@ def least_possible(design: ObserverDesign, *, later: bool = False) -> LeastPossi
         delay,
         np.nan if after is None else _least(bounded, after, "hinf"),
         bool(plant.nw),
+        bool(plant.nd) and gain == 0.0,
     )
 
 

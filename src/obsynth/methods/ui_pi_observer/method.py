@@ -146,7 +146,9 @@ class UiPiObserver(Method):
             "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
         ),
         "noise_price": ClaimMeaning(
-            "", "noise of the fault estimates against the quietest Kalman filter of the same plant", STATED_BY_SEARCH
+            "",
+            "noise of the fault estimates against the Kalman filter of the search without a least decay",
+            STATED_BY_SEARCH,
         ),
         "digits": ClaimMeaning(
             "",
