@@ -1,4 +1,4 @@
-"""The hypotheses on an alarm, the most likely first."""
+"""The possible causes of an alarm, the most likely first."""
 
 from __future__ import annotations
 
@@ -6,34 +6,32 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-#: What an alarm is called that no effect of a fault explains, and one by a sensor, before the name of its output.
+#: Name of the cause of an alarm that no fault explains, and prefix of a faulty sensor before the name of its output.
 NONE_OF_THESE, SENSOR = "none of these faults", "sensor "
 
 
 class Ranking(NamedTuple):
-    """What an alarm may be, the most likely first: names and posterior shares; the one that it is called by, and those
-    that are as likely; whether that one drifts, and for a sensor how far off it is, with its deviation; how many other
-    changes came before it, and twice its log likelihood ratio where the effects of these are subtracted."""
+    """The possible causes of an alarm, with their posterior shares."""
 
-    shares: tuple[tuple[str, float], ...]
-    named: str
-    ties: tuple[str, ...] = ()
-    drifts: bool = False
-    size: float = math.nan
-    deviation: float = math.nan
-    earlier: int = 0
-    ratio: float = math.nan
+    shares: tuple[tuple[str, float], ...]  # names with their shares, the most likely first
+    named: str  # the cause that the alarm is named by
+    ties: tuple[str, ...] = ()  # causes that are as likely
+    drifts: bool = False  # whether the named cause is a drift
+    size: float = math.nan  # of a sensor's fault
+    deviation: float = math.nan  # standard deviation of this size
+    earlier: int = 0  # number of changes that were named before
+    ratio: float = math.nan  # twice the log likelihood ratio after subtraction of the effects of earlier changes
 
     @property
     def is_sensor(self) -> bool:
-        """Whether it is called by a sensor."""
+        """Whether the alarm is named by a sensor."""
         return self.named.startswith(SENSOR)
 
     @property
     def candidates(self) -> str:
-        """All that is as likely, faults of the plant first."""
+        """The named cause and those that are as likely, as a text."""
         return " or ".join((self.named, *self.ties))
 
     def called(self, faults: Sequence[str]) -> str:
-        """Return the name of an alarm: empty where several ``faults`` of the plant are as likely."""
+        """Return the name of an alarm: empty if several ``faults`` of the plant are equally likely."""
         return "" if self.named in faults and any(name in faults for name in self.ties) else self.named

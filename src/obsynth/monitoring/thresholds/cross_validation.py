@@ -1,10 +1,11 @@
-"""Block cross-validation of learned levels: on rows that nothing was learned from, within a log and between logs.
+"""Block cross-validation of learned levels within a log and between logs.
 
-A level that rows keep from which everything was learned says little of other rows: centres, scales and colours are
-those of these rows.  So each log (or each fifth of a single log) is judged with what the others say (blocks, as rows
-follow each other: Racine 2000).  The largest value of each statistic in a part gives a prediction interval for that of
-another part, which its level is not below; all together keep the rate of false alarms there; and the share of these
-rows that is in alarm, where also the level comes from the other parts, is the share of healthy time in alarm.
+Levels from the rows that the model was fitted to are too low for other rows, whose means, variances and
+autocorrelations differ.  Therefore each log, or each fifth of a single log, is evaluated with the model of the others;
+blocks are used since rows are autocorrelated (Racine 2000).  The largest values of a statistic in the parts give a
+prediction interval for that of another part, and its level is at least the end of this interval.  All statistics
+together keep the rate of false alarms in held-out parts.  The share of healthy time in alarm is that of the rows of a
+part that exceed the levels from the other parts.
 """
 
 from __future__ import annotations
@@ -22,32 +23,32 @@ from obsynth.monitoring.thresholds.parameter_scores import Scores
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import fitted_autoregression
 
-#: Parts of a single log that are left out in turn, and the confidence with which another part stays below a level.
+#: Number of parts of a single log that are held out in turn, and confidence that another part stays below a level.
 PARTS_OF_ONE_LOG, PART_CONFIDENCE = 5, 0.95
 
-#: One log says nothing of how logs differ.  Noise and errors of the model are taken to be up to a fifth larger in
-#: another one, and what samples say of faults, which are in the observer's own deviations, by a twentieth: levels,
-#: which are squares, are so many times as high.
+#: One log does not show how logs differ.  Noise and model errors are assumed to be up to a fifth larger in another log,
+#: and scores of faults, which are in units of the observer's own deviations, up to a twentieth.  Levels, which are
+#: squares, are raised by these factors.
 ONE_LOG_FACTOR, ONE_LOG_FACTOR_OF_FAULTS = 1.2**2, 1.05**2
 
-#: Confidence of the interval on each side, and the rows in alarm that are still likely where none is seen: three alarms
-#: (the rule of three: Hanley & Lippman-Hand 1983), which last as long as an alarm does at least.
+#: Confidence of the interval on each side, and upper limit of rows in alarm if there are none: three alarms (the rule
+#: of three: Hanley & Lippman-Hand 1983) of the least duration of an alarm.
 SHARE_CONFIDENCE, UNSEEN_ROWS = 0.975, 3 * HOLD
 
 
 class HeldOut(NamedTuple):
-    """Statistics ``(k, n)`` of normal rows by what was learned from the others, and the parts that were left out."""
+    """Statistics of rows without faults, each part with the model of the others."""
 
-    values: FloatArray
-    parts: tuple[slice, ...]
+    values: FloatArray  # ``(k, n)``
+    parts: tuple[slice, ...]  # the rows of each part
 
     def without(self, place: int) -> HeldOut:
-        """Return these without one part."""
+        """Return the statistics without one part."""
         return self._replace(parts=self.parts[:place] + self.parts[place + 1 :])
 
 
 class HealthyTime(NamedTuple):
-    """The share of healthy rows in alarm: what is expected, and the interval that holds it."""
+    """The expected share of healthy rows in alarm, and its confidence interval."""
 
     expected: float
     low: float
@@ -55,7 +56,8 @@ class HealthyTime(NamedTuple):
 
 
 def room_for_other_logs(statistics: Statistics, logs: Sequence[slice]) -> FloatArray:
-    """Return by how much the level of each statistic is raised ``(k,)`` as nothing shows how logs differ."""
+    """Return the factor of the level of each statistic ``(k,)`` for differences between logs, which one log does not
+    show; ones for several logs."""
     factors = np.ones(len(statistics.names))
     if len(logs) < 2:
         factors[:] = ONE_LOG_FACTOR
@@ -66,7 +68,7 @@ def room_for_other_logs(statistics: Statistics, logs: Sequence[slice]) -> FloatA
 
 def held_out(x: FloatArray, statistics: Statistics, scores: Scores | None, logs: Sequence[slice]) -> HeldOut:
     """Return the statistics of rows ``(n, m)`` with the autoregression and the centres of the other logs, or of the
-    other parts of one log; ``scores``: what these rows say of faults."""
+    other parts of one log; ``scores`` are those of these rows for the faults."""
     n = len(x)
     ends = np.linspace(0, n, PARTS_OF_ONE_LOG + 1).astype(np.int64).tolist()
     parts = tuple(logs) if len(logs) > 1 else tuple(slice(a, b) for a, b in pairwise(ends))
@@ -85,14 +87,17 @@ def held_out(x: FloatArray, statistics: Statistics, scores: Scores | None, logs:
 
 
 def not_held_out(x: FloatArray, statistics: Statistics, scores: Scores | None) -> HeldOut:
-    """Return the statistics of rows ``(n, m)`` by what was learned from themselves."""
+    """Return the statistics of rows ``(n, m)`` with the model of these rows themselves, as one part."""
     usual = None if scores is None else (scores.centre(), np.ones(len(statistics.estimates)))
     return HeldOut(normal_statistics(x, statistics, scores, usual), (slice(0, len(x)),))
 
 
 def levels_of_other_parts(levels: FloatArray, held: HeldOut, every: float) -> FloatArray:
-    """Return levels ``(k,)``, none below ``levels``, that rows keep which nothing was learned from: each statistic the
-    largest that is to be expected in another part, and all of them together one alarm per ``every`` rows."""
+    """Return levels ``(k,)``, none below ``levels``, that are valid for held-out rows.
+
+    Each is at least the end of the prediction interval for the largest value in another part, and all together give one
+    alarm per ``every`` rows.
+    """
     from scipy.special import stdtrit
 
     largest = np.sqrt([held.values[:, part].max(axis=1) for part in held.parts])
@@ -107,8 +112,10 @@ def levels_of_other_parts(levels: FloatArray, held: HeldOut, every: float) -> Fl
 
 
 def healthy_time(levels: FloatArray, held: HeldOut, every: float, factors: FloatArray) -> HealthyTime:
-    """Return the share of the rows of another part in alarm, by levels ``(k,)`` and those parts whose level comes from
-    the others; ``factors (k,)``: by how much they are raised after that."""
+    """Return the share of the rows of a part in alarm with the levels from the other parts.
+
+    These are at least ``levels (k,)``, and are finally multiplied by ``factors (k,)``.
+    """
     from scipy.special import stdtrit
 
     shares, rows = [], 0

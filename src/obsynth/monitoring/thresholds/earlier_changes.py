@@ -1,15 +1,15 @@
-"""Changes that were named already: what is left of the residuals when their effects are subtracted.
+"""Earlier changes: tests for a later change after the effects of changes that were already named are subtracted.
 
-While an alarm stands, and for as long as begins from before it are followed, the effect of the change that it was named
-by is in the rows, and explains more of them than one that came later.  A later change is therefore judged by what it
-explains beside the earlier ones, and beside a constant shift of the white rows, which is what errors of the model leave
-of them: by least squares over all, with their scores s and information J, and the products c of their effects with its
-own,
+During an alarm, and as long as earlier beginnings are followed, the rows contain the effect of the change that the
+alarm is named by.  That change explains more of them than a later one.  A later change is therefore tested after least
+squares over the earlier changes and a constant shift of the whitened rows, which stands for errors of the model.  With
+their scores s and information J, and the inner products c of their effects with that of the hypothesis h, its score and
+information become
 
 .. math::
     \\tilde s = s_h - c' J^{-1} s, \\qquad \\tilde J = J_h - c' J^{-1} c
 
-whose quotient is how much twice the log likelihood gains by one more change (Willsky & Jones 1976).
+The increase of twice the log likelihood by the later change is ``s^2 / J`` of these (Willsky & Jones 1976).
 """
 
 from __future__ import annotations
@@ -23,38 +23,41 @@ from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
 from obsynth.monitoring.thresholds.hypotheses import LEAST_RATIO, ratio_scale
 from obsynth.numerics.arrays import FloatArray, read_only
 
-#: Changes in a row whose effects are subtracted; one more has no name of its own.
+#: Largest number of successive changes whose effects are subtracted; a further change gets no name.
 MOST_KEPT = 3
 
-#: Rows of an alarm in which its likeliest begins are looked for; after that they stay, as long as it lasts, and what
-#: begins later is judged beside the change that it is named by.
+#: Number of rows of an alarm in which its likeliest beginnings are searched.  These are then kept as long as the alarm
+#: lasts, and later beginnings are tested after subtraction of the named change.
 LOOKED_FOR = 20
 
-#: Share of what samples say of a later change that those before leave of it at least: of less, it is one of these.
+#: If less than this share of the information on a later change is left after subtraction of the earlier ones, it is not
+#: distinguished from these.
 LEAST_LEFT = 0.01
 
 _NOTHING = read_only(np.zeros(0))
 
 
 class EarlierChanges(NamedTuple):
-    """A shift of white rows and changes that were named, ``r = m + MOST_KEPT`` (those that are not there are zero), and
-    what their effects share with those of the hypotheses ``h`` at each begin that is followed ``b``."""
+    """A shift of the ``m`` whitened columns and the named changes, ``r = m + MOST_KEPT`` regressors in all.
 
-    places: FloatArray = _NOTHING  # places, hypotheses: ``(MOST_KEPT,)``: begins of the changes, and what they are
-    hypotheses: FloatArray = _NOTHING
+    Unused regressors are zero.  ``b`` is the number of followed beginnings, and ``h`` that of hypotheses.
+    """
+
+    places: FloatArray = _NOTHING  # ``(MOST_KEPT,)``: numbers of the beginnings of the changes
+    hypotheses: FloatArray = _NOTHING  # ``(MOST_KEPT,)``: numbers of their hypotheses
     score: FloatArray = _NOTHING  # ``(r,)``
     information: FloatArray = _NOTHING  # ``(r, r)``
-    shared: FloatArray = _NOTHING  # ``(b, h, r)``: products of effects on white rows
-    sums: FloatArray = _NOTHING  # ``(b, m, r)``: sums of their effects
-    changes: int = 0  # how many there are
-    number: int = 0  # of these, and of alarms that no change explains
-    since: float = 0.0  # the row in which the last of them was kept: what began later is judged beside them
-    looked: int = 0  # rows in which something that began later has been the likeliest
-    is_over: int = 0  # whether the alarm that the last of them raised has ended
+    shared: FloatArray = _NOTHING  # ``(b, h, r)``: inner products of effects of hypotheses with the regressors
+    sums: FloatArray = _NOTHING  # ``(b, m, r)``: sums of the regressors over the rows of each beginning
+    changes: int = 0  # number of named changes
+    number: int = 0  # number of these and of alarms that no change explains
+    since: float = 0.0  # row of the last one; later beginnings are tested after subtraction
+    looked: int = 0  # number of rows in which a later beginning was the likeliest
+    is_over: int = 0  # whether the alarm of the last change has ended
 
     @classmethod
     def none(cls, begins: int, channels: int, hypotheses: int) -> EarlierChanges:
-        """Return the state without any."""
+        """Return the state without earlier changes."""
         r = channels + MOST_KEPT
         return cls(
             np.zeros(MOST_KEPT),
@@ -67,11 +70,11 @@ class EarlierChanges(NamedTuple):
 
     @property
     def begins(self) -> NDArray[np.intp]:
-        """The places of the begins of the changes."""
+        """The numbers of the beginnings of the changes."""
         return self.places[: self.changes].astype(np.intp)
 
     def with_begin(self, place: int) -> EarlierChanges:
-        """Return the state in which a begin is followed in the ``place`` of another one."""
+        """Return the state in which a new beginning replaces the one with the number ``place``."""
         if not self.number:
             return self
         shared, sums = self.shared.copy(), self.sums.copy()
@@ -79,8 +82,10 @@ class EarlierChanges(NamedTuple):
         return self._replace(shared=shared, sums=sums)
 
     def moved(self, added: FloatArray, counted: FloatArray, white: FloatArray) -> EarlierChanges:
-        """Return the state after a ``white (m,)`` row, to which hypotheses have ``added (b, m, h)``; those that are
-        ``counted (b,)`` are judged by it."""
+        """Return the state after a ``white (m,)`` row, on which hypotheses have the effects ``added (b, m, h)``.
+
+        ``counted (b,)``: the beginnings that are tested with this row.
+        """
         if not self.number:
             return self
         m = len(white)
@@ -96,7 +101,7 @@ class EarlierChanges(NamedTuple):
         )
 
     def kept(self, row: float) -> EarlierChanges:
-        """Return the state in which what begins after a ``row`` is judged beside what is there."""
+        """Return the state in which changes that begin after a ``row`` are tested after subtraction."""
         before = (self.score, self.information, self.shared, self.sums)
         score, information, shared, sums = before if self.number else (np.zeros_like(part) for part in before)
         return self._replace(
@@ -111,7 +116,7 @@ class EarlierChanges(NamedTuple):
         )
 
     def with_change(self, place: int, hypothesis: int, score: float, information: float) -> EarlierChanges:
-        """Return the state with one more change, of so much score and information; with no more than `MOST_KEPT`."""
+        """Return the state with one more change and its score and information; unchanged if there are `MOST_KEPT`."""
         n = self.changes
         if n == MOST_KEPT:
             return self
@@ -129,7 +134,7 @@ class EarlierChanges(NamedTuple):
     def beside(
         self, score: FloatArray, information: FloatArray, sums: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return score and information ``(b, h)``, and sums of white rows ``(b, m)``, that are left beside them."""
+        """Return score and information ``(b, h)``, and sums of whitened rows ``(b, m)``, after subtraction."""
         n = len(self.score) - MOST_KEPT + self.changes
         inverse = np.linalg.pinv(self.information[:n, :n], hermitian=True)
         sizes, shared = inverse @ self.score[:n], self.shared[..., :n]
@@ -139,13 +144,15 @@ class EarlierChanges(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Twice the log likelihood ratio of all of them."""
+        """Twice the log likelihood ratio of all earlier changes together."""
         inverse = np.linalg.pinv(self.information, hermitian=True)
         return float(self.score @ inverse @ self.score)
 
     def distinguishes(self, later: Ranking, ratio: float, names: set[str]) -> bool:
-        """Whether a ``later`` change, of so large a ``ratio`` beside these, is more than what errors of the model leave
-        of their effects, and something else than they, whose ``names`` these are."""
+        """Whether a ``later`` change is significant, and another one than the earlier ones with these ``names``.
+
+        Its ``ratio`` after subtraction must exceed what errors of the model leave of the earlier effects.
+        """
         if names & {later.named, *later.ties} or later.named == NONE_OF_THESE:
             return False
         return ratio >= LEAST_RATIO * ratio_scale(self.ratio)

@@ -1,8 +1,8 @@
-"""Growth of a pointwise bound after missing outputs: the error of the plant's model, which replaced them.
+"""Growth of a pointwise bound after missing outputs, which the plant's model has predicted.
 
-At the last complete row its states and faults are off by ``zeta = S e + S_q q`` (inputs q of the plant, each at most
-one); after j rows without outputs these are off by ``M^j zeta - sum M^l [Bq; 0] q``, ``M = [A Bf; 0 I]``, so that the
-outputs that were told to the observer are off by ``delta = [C Df] (...) - Dq q``, and ``e+ = A e + ... - By delta``.
+At the last complete row the states and faults of the model have the error ``zeta = S e + S_q q`` with inputs q of the
+plant, each at most one.  After j rows without outputs their error is ``M^j zeta - sum M^l [Bq; 0] q`` with ``M = [A Bf;
+0 I]``.  The predicted outputs then have the error ``delta = [C Df] (...) - Dq q``, and ``e+ = A e + ... - By delta``.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from obsynth.monitoring.thresholds.residual_model import ResidualModel
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.verification.error_system import ErrorModel
 
-#: States that are solved from the observer's own and the outputs are these, up to rounding.
+#: Rounding up to which the states count as determined by the observer's states and the outputs.
 SOLVED_SHARE = 1e-9
 
-#: Largest share of a sample, in units of 1 / norm of A, in which a slope is bounded at once.
+#: Largest length of an interval, in units of 1 / norm of A, over which a slope is bounded at once.
 SLOPE_PIECE = 0.1
 
-#: Columns that are kept apart; more of them are put together to a box, which holds them.
+#: Largest number of columns of the error; more are replaced by a box that contains them.
 MOST_APART = 200
 
-#: What is smaller, of what the error may be without a gap, is rounding of the threshold.
+#: Errors by a gap below this share of the error without a gap are rounding of the threshold.
 GAP_ROUNDING = 2.0**-52
 
 
 class GapState(NamedTuple):
-    """What missing outputs have left: columns ``(n, any)`` whose sum, each times at most one, is in the error."""
+    """The effect of missing outputs on the error: the sum of ``columns (n, any)``, each times at most one."""
 
     columns: FloatArray
-    begun: FloatArray  # those at the last complete row
-    age: int = 0  # rows since then
+    begun: FloatArray  # the columns at the last complete row
+    age: int = 0  # number of rows since then
 
 
 class GapGrowth:
-    """What missing outputs add to the pointwise bound of a sampled design."""
+    """The addition to the pointwise bound of a sampled design by missing outputs."""
 
     def __init__(self, errors: ErrorModel, model: ResidualModel, sizes: FloatArray, factor: float) -> None:
         plant, observer = errors.plant, errors.observer
@@ -57,27 +57,28 @@ class GapGrowth:
         contraction = largest_singular_value(self._last)
         self._aged /= 1.0 - contraction
         self._size = np.abs(self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(model.A))
-        # By age: what the outputs of the model may miss, and how they hang on the error at the last complete row.
+        # By age: bounds on the errors of the predicted outputs, and their dependence on e at the last complete row.
         self._misses: list[FloatArray] = [np.abs(self._Dq).sum(axis=1)]
         self._maps: list[FloatArray] = [np.zeros((plant.ny, len(model.A)))]
         self._power, self._drift = np.eye(nx + nf), np.zeros(plant.ny)
-        # States that lag are those of earlier rows: the model goes on from there.
+        # Lagging state estimates belong to earlier rows, from which the model starts.
         for _ in range(max(observer.state_delays, default=0)):
             self._further()
 
     def start(self) -> GapState:
-        """Return the state where nothing is missing."""
+        """Return the state before the first missing output."""
         nothing = np.zeros((len(self._A), 0))
         return GapState(nothing, nothing)
 
     def missed(self, age: int) -> tuple[FloatArray, FloatArray]:
-        """Return ``(ny,)``: what outputs may miss ``age`` rows after a complete one; ``(ny, n)``: per error there."""
+        """Return bounds ``(ny,)`` on the errors of predicted outputs ``age`` rows after a complete row, and their
+        dependence ``(ny, n)`` on the error at that row."""
         while len(self._misses) <= age:
             self._further()
             reading = self._H @ self._power
             on_errors = reading @ self._S
             reach = np.abs(on_errors @ self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(reading))
-            # What is older than all powers, as in `unlimited_bound`.
+            # Inputs that are older than all stored powers, as in `unlimited_bound`.
             older = np.linalg.norm(np.einsum("ij,kjl->kil", on_errors, self._powers), axis=2).sum(axis=0) * self._aged
             own = np.abs(reading @ self._Sq).sum(axis=1)
             self._misses.append(reach + older + own + self._drift + self._misses[0])
@@ -90,7 +91,7 @@ class GapGrowth:
         self._power = self._M @ self._power
 
     def after(self, state: GapState, sample: Sample) -> tuple[GapState, float]:
-        """Return the state after a row, and what gaps before it add to the norm of what is watched at it."""
+        """Return the state after a row, and the addition by earlier gaps to the norm of the watched signals."""
         for _ in range(sample.skipped):
             state = self._without(state, np.ones(len(self._H), dtype=bool))
         grown = float(np.linalg.norm(self._C @ state.columns, axis=0).sum())
@@ -113,7 +114,7 @@ class GapGrowth:
         return GapState(self._kept(np.hstack([columns, new])), state.begun, age)
 
     def _kept(self, columns: FloatArray) -> FloatArray:
-        """Return columns that hold the same: none that are rounding, and not too many."""
+        """Return columns with the same or a larger effect: none if all are rounding, and at most `MOST_APART`."""
         sizes = np.abs(columns).sum(axis=1)
         if (sizes <= GAP_ROUNDING * self._size).all():
             return columns[:, :0]
@@ -121,12 +122,12 @@ class GapGrowth:
 
 
 def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return columns ``(nx, any)`` that disturbances add to the states in a sample, and ``(ny, any)`` to the outputs.
+    """Return the effects of disturbances on the states in a sample, ``(nx, any)``, and on the outputs, ``(ny, any)``.
 
-    Between samples they may do anything: the states take their mean, and the outputs their value at the sample; what
-    the states take besides the mean is ``int (e^(A s) b - mean) d ds``, of at most ``L h^2 / 3`` for the largest slope
-    L of ``e^(A s) b``, state by state.  States after those of the continuous plant hold readings that are late: they
-    take the value at the sample.
+    Disturbances may change arbitrarily between samples.  The mean over the interval and the value at the sample are
+    separate inputs: the first acts on the states, the second on the outputs.  The remaining effect on the states is
+    ``int (e^(A s) b - mean) d ds``, at most ``L h^2 / 3`` with the largest slope L of ``e^(A s) b`` in each state.
+    States after those of the continuous plant are delayed outputs, on which the value at the sample acts.
     """
     plant, sampled = errors.plant, model.sampled
     if sampled is None:
@@ -146,7 +147,7 @@ def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -
 
 
 def _stand_in(errors: ErrorModel, Bq: FloatArray, Dq: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far the states that the model starts from, and the faults it holds, are off: per error and input."""
+    """Return the errors of the states that the model starts from and of the held faults, per error and input."""
     plant, observer = errors.plant, errors.observer
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
 
@@ -169,7 +170,10 @@ def _stand_in(errors: ErrorModel, Bq: FloatArray, Dq: FloatArray) -> tuple[Float
 
 
 def gap_growth(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> GapGrowth | str:
-    """Return what missing outputs add to a pointwise bound, or why that is not known; ``bounds (nd,)``."""
+    """Return the growth of a pointwise bound by missing outputs, or the reason why it is unknown.
+
+    ``bounds (nd,)`` are those of the disturbances.
+    """
     errors = model.errors
     if model.continuous is not None:
         return "between samples of a continuous design the plant's model has no bound"

@@ -14,20 +14,20 @@ from obsynth.monitoring.thresholds.learned_from_rows import LeftOut, Raised
 from obsynth.monitoring.thresholds.learned_levels import CHANCE_DEVIATIONS, normal_scores
 from obsynth.numerics.arrays import FloatArray
 
-#: An input moves where it changes by more than so many times what is usual for it: one that is held moves where it
-#: changes at all, a sine nowhere.
+#: An input counts as moving in a row if it changes by more than so many times its median change.  A held input moves
+#: wherever it changes, and a sine nowhere.
 MOVES = 5.0
 
-#: Rows from a move on whose residuals are compared with those of as many rows without one, the least number of moves,
-#: the share of the residuals that counts as large, and how many times as large these must be to be reported.
+#: Number of rows from a move on whose residuals are compared with those of other rows, least number of moves, share of
+#: the residuals that count as large, and factor by which these must be larger to be reported.
 AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
 
 
-#: Changes have to be so many times as large to be noticed beside events that are no noise: levels are of no use. A
-#: larger factor says no more of the plant than that.
-USELESS_FACTOR, MOST_TOLD_FACTOR = 100.0, 1000.0
+#: Levels are useless if events raise them so much that a change must be so many times larger; factors above the second
+#: number are not printed.
+USELESS_FACTOR, MOST_REPORTED_FACTOR = 100.0, 1000.0
 
-#: A level of an estimate that is not watched: its largest value without a fault, and half as much as room for others.
+#: Suggested level of an estimate that is not watched, in units of its largest value without a fault.
 ROOM_ABOVE = 1.5
 
 
@@ -40,8 +40,11 @@ def notes_of_normal_rows(
     ends: Sequence[tuple[int, int]],
     stamps: Sequence[Stamps],
 ) -> tuple[str, ...]:
-    """Return the notes on rows ``wanted`` of logs with ``times (n,)``, one after the other with these ``ends``: on
-    events that stand in rows of these ``numbers``, and on outputs, by name, that are stuck."""
+    """Return the notes on ``wanted`` rows of logs: on events that raise levels, and on stuck outputs.
+
+    ``numbers`` are those of the rows that levels were learned from, in which events are counted.  ``times (n,)`` are
+    those of all rows, and ``ends`` the first and last rows of each log.
+    """
 
     def shown(first: int, last: int) -> str:
         place = next(i for i, (_, end) in enumerate(ends) if first < end)
@@ -67,10 +70,10 @@ def notes_of_normal_rows(
 
 
 def _on_events(where: str, raised: Raised) -> str:
-    """Return what is to be known of events that stand out of rows ``where``."""
+    """Return the note on events in the rows ``where``."""
     if raised.factor >= USELESS_FACTOR:
-        most = raised.factor > MOST_TOLD_FACTOR
-        times = f"more than {MOST_TOLD_FACTOR:.0f}" if most else f"{raised.factor:.3g}"
+        most = raised.factor > MOST_REPORTED_FACTOR
+        times = f"more than {MOST_REPORTED_FACTOR:.0f}" if most else f"{raised.factor:.3g}"
         return (
             f"These thresholds are of no use: what stands out of {where} is no noise (a fault, or wrong samples), and "
             f"with it a change has to be {times} times larger to pass the level of {raised.statistic!r}. Blank its "
@@ -84,7 +87,7 @@ def _on_events(where: str, raised: Raised) -> str:
 
 
 def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
-    """Return what is to be known where whitened residuals ``(n, m)`` are larger after moves of ``inputs (n, nu)``."""
+    """Return a note if whitened residuals ``(n, m)`` are larger after moves of ``inputs (n, nu)``."""
     count, ratio = _larger_at_moves(np.sum(white**2, axis=1), inputs)
     if ratio < LARGER:
         return ()
@@ -97,7 +100,7 @@ def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
 
 
 def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
-    """Return what is to be known of faults that are ``divided`` from the offset of a sensor anew at each start."""
+    """Return notes on faults whose estimates are ``divided`` from the offset of a sensor at the start of a log."""
     return tuple(
         f"The estimate of {name} stays what the start of this log made of it and of the unknown offset of a sensor: it "
         f"varies by {share:.2g} of its standard deviation here. A run with another start may alarm without a fault: go "
@@ -107,7 +110,7 @@ def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def notes_of_left_out(estimates: Sequence[LeftOut], learned: LearnedThresholds) -> tuple[str, ...]:
-    """Return what is to be known of estimates of faults that are not watched."""
+    """Return notes on estimates of faults that are not watched."""
 
     def reason(estimate: LeftOut) -> str:
         if estimate.is_redundant:
@@ -127,8 +130,8 @@ def notes_of_left_out(estimates: Sequence[LeftOut], learned: LearnedThresholds) 
 
 
 def _larger_at_moves(sizes: FloatArray, inputs: FloatArray) -> tuple[int, float]:
-    """Return how many moves of ``inputs (n, nu)`` there are, and how many times as large residuals of squares ``sizes
-    (n,)`` are after these; zero where that may be chance."""
+    """Return the number of moves of ``inputs (n, nu)``, and the factor by which residuals with squares ``sizes (n,)``
+    are larger after them; zero if that may be chance."""
     windows = np.lib.stride_tricks.sliding_window_view(sizes, AFTER_A_MOVE).mean(axis=1)
     changes = np.abs(np.diff(inputs, axis=0, prepend=inputs[:1]))
     moves = np.any(changes > MOVES * np.nanmedian(changes, axis=0), axis=1)

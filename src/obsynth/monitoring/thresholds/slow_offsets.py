@@ -1,11 +1,11 @@
-"""Slow offsets in rows without faults: how far the mean of a signal may be elsewhere than where a log has it.
+"""Slow offsets in rows without faults: a bound on the distance of the mean of a signal in another log.
 
-A log says where a signal usually is only as well as it holds independent values of what moves slowly: an offset that
-drifts through the whole log is one value of it.  Each log is divided into so many parts, and the variance of their
-means beyond that of noise, with as few degrees of freedom as there are parts, gives a prediction interval for the mean
-of a part of another log (Hahn & Meeker 1991, section 4.7).  The widest over all numbers of parts counts: in two or
-three parts drifts show, in many what comes and goes.  With several logs the parts of all are compared with each other,
-and where there are three and more, whole logs.
+A log determines the usual mean of a signal only from independent values of slow offsets: an offset that drifts through
+the whole log is a single value.  Each log is divided into parts.  The variance of their means beyond that of noise,
+with as few degrees of freedom as there are parts, gives a prediction interval for the mean of a part of another log
+(Hahn & Meeker 1991, section 4.7).  The widest interval over several numbers of parts is used: few parts show drifts,
+and many parts show temporary offsets.  The parts of several logs are compared with each other; with three or more logs,
+so are whole logs.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 
-#: Numbers of parts of a log; a part has so many rows at least.
+#: Numbers of parts of a log, and least number of rows of a part.
 PARTS, LEAST_PART = (1, 3, 6, 12, 24), 100
-#: Confidence of the interval on each side, and level of the test whether there is more than noise.
+#: Confidence of the interval on each side, and confidence of the test for more variance than that of noise.
 CONFIDENCE, SIGNIFICANCE = 0.975, 0.99
 
 
 def offset_bound(values: FloatArray, weights: FloatArray, logs: Sequence[slice]) -> float:
-    """Return the bound on a slow offset in units of ``values / weights``, from values ``(n,)`` of mean ``weights *
-    offset`` and variance ``weights (n,)``; zero where the means of parts show nothing but noise."""
+    """Return the bound on a slow offset in units of ``values / weights``; zero if the means of parts show only noise.
+
+    The ``values (n,)`` have the means ``weights * offset`` and the variances ``weights (n,)``.
+    """
     from scipy.special import chdtri, stdtrit
 
     bound = 0.0

@@ -1,4 +1,4 @@
-"""The columns of an observer's rows that learned thresholds watch, and what is not watched."""
+"""The columns of an observer's rows that learned thresholds may watch."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.results.design import ObserverDesign
 
-#: Share of an error at the start of a run below which rows are like those that follow.
+#: Rows count as settled if less than this share of the error at the start of a run is left.
 START_REMAINDER = 1e-3
 
 
 def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
-    """Return an observer as the one from which thresholds were learned judged outliers."""
+    """Return an observer with the sizes of outliers and the initial covariance of the learned thresholds."""
     options = {"outlier_sizes": learned.outlier_sizes, "initial_covariance": learned.initial_covariance}
     stated = {name: value for name, value in options.items() if value is not None}
     return changed(observer, **stated) if stated else observer
 
 
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:
-    """Return what may be watched of a design: fault estimates, then residuals (or innovations)."""
+    """Return the columns of a design that may be watched: fault estimates, then residuals (or innovations)."""
     observer = design.observer
     if isinstance(observer, WindowObserver):
         raise SpecError(
@@ -48,10 +48,10 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
 
 
 def settling_rows(design: ObserverDesign) -> int:
-    """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these.
+    """Return the number of rows at the start of a run that are not settled; zero for designs with a warm-up.
 
-    Of a Kalman filter whose gains tend to a steady state they are those in which the error at the start decays to
-    `START_REMAINDER` of itself.
+    For a Kalman filter whose gains tend to a steady state, this is the number of rows in which an initial error decays
+    to `START_REMAINDER` of itself.
     """
     observer = design.observer
     if isinstance(observer, (LinearObserver, RegionObserver, ScheduledObserver)):
@@ -65,16 +65,16 @@ def settling_rows(design: ObserverDesign) -> int:
 
 
 def has_innovations_by_sensor(observer: Any) -> bool:
-    """Whether each residual is the innovation of one sensor, which says the same where another one is missing."""
+    """Whether each residual is the innovation of one sensor, whose distribution does not depend on missing others."""
     return not isinstance(
         observer, (LinearObserver, RecursiveObserver, RegionObserver, ScheduledObserver, WindowObserver)
     )
 
 
 def innovation_names(observer: Any) -> tuple[str, ...]:
-    """Return the names of the innovations of a recursive or nonlinear observer, as columns of runs have them."""
+    """Return the names of the innovations of a recursive or nonlinear observer, as in the columns of runs."""
     if isinstance(observer, RecursiveObserver):
-        # H_k has as many directions beside the state as there are parity innovations.
+        # These are innovations of the parity space, and not of single outputs.
         return tuple(f"innovation {i + 1}" for i in range(observer.innovation_count))
     names: tuple[str, ...] = observer.plant.output_names
     return names

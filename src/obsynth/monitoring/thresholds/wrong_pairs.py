@@ -1,9 +1,9 @@
-"""Pairs of wrong samples in rows without faults, of which an outlier gate accepts the second and later rows refute it.
+"""Pairs of consecutive wrong samples in rows without faults, of which an outlier gate accepts the second.
 
-A gate leaves the first sample of a fault out and believes the second.  Two wrong samples of one sensor in a row, as far
-off on one side, look the same; but once both are left out, the next sample is where it was predicted.  In rows without
-faults that decides.  They count as not measured there, and the rate at which single ones come together by chance, at
-which each will alarm, is taken off the rate of false alarms.
+A gate rejects the first sample after a jump of a fault and accepts the second.  Two consecutive wrong samples of a
+sensor, with similar errors, look the same.  In rows without faults they are recognised by running the observer without
+both: the next sample then agrees with its prediction.  Such pairs count as not measured.  By chance they also occur in
+later runs, where each causes an alarm; their rate is subtracted from the rate of false alarms.
 """
 
 from __future__ import annotations
@@ -15,16 +15,18 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 
-#: Probability with which an outlier is nearer than what is taken as their least size, and how many show that.
+#: Probability that an outlier is smaller than their estimated least size, and least number of outliers to estimate it.
 NEARER, LEAST_WRONG = 1e-3, 4
 
-#: Samples of one output: the first and the last of their rows, and which output.
+#: Consecutive samples of one output: the first and the last row, and the number of the output.
 Pair: TypeAlias = tuple[int, int, int]
 
 
 def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
-    """Return the samples that a gate believed after those before them in a row, which it left out, with these: from its
-    memory after each row ``(4, ny)``, and what was measured ``(n, ny)``."""
+    """Return the samples that a gate accepted after it had rejected those directly before them, together with these.
+
+    ``refused`` is the state of the gate after each row ``(4, ny)``, and ``y (n, ny)`` are the measurements.
+    """
     pairs, begun = [], np.full(y.shape[1], -1)
     for k, (memory, measured) in enumerate(zip(refused, np.isfinite(y), strict=True)):
         before = refused[k - 1] if k else np.zeros_like(memory)
@@ -35,7 +37,7 @@ def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
 
 
 def without(y: FloatArray, pairs: Sequence[Pair]) -> FloatArray:
-    """Return what was measured ``(n, ny)`` without these pairs."""
+    """Return the measurements ``(n, ny)`` without these pairs."""
     measured = y.copy()
     for first, last, output in pairs:
         measured[first : last + 1, output] = np.nan
@@ -43,8 +45,8 @@ def without(y: FloatArray, pairs: Sequence[Pair]) -> FloatArray:
 
 
 def taken_back(pairs: Sequence[Pair], refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
-    """Return the pairs after which the next sample is no outlier, by the memory of a gate to which none of them was
-    shown."""
+    """Return the pairs after which the next sample is no outlier, by the states ``refused`` of a gate in a run without
+    all pairs."""
     far = np.array([memory[0] != 0.0 for memory in refused])
     wrong = []
     for first, last, output in pairs:
