@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.functions import descriptor_kalman
 from obsynth.monitoring.calibration.diagnostics import Consistency, SensorValidation
 from obsynth.monitoring.calibration.explanations import Explanation
+from obsynth.monitoring.calibration.hidden_motions import kalman_filter_of_what_shows
 from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.unit_check import UnitCheck
@@ -51,7 +51,7 @@ def filter_of_linear_plant(
     _require_sensor_noise(design, plant)
     if not plant.is_discrete:
         plant = discretise(plant, log.dt).plant
-    made = descriptor_kalman(plant, outliers="gate", name=design.name)
+    made = kalman_filter_of_what_shows(plant, name=design.name)
     observer = made.observer
     if not isinstance(observer, RecursiveObserver):
         raise TypeError(f"{type(observer).__name__} is no recursion")
