@@ -30,8 +30,10 @@ AfterStep: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
 
 
 class Observer(ABC, Generic[State, Row]):
-    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays. `advance`
-    is `step` without checks of the sample, and returns the row of numbers that the estimates are made of."""
+    """An observer.  It is immutable, so that it serves any number of runs; its state is a tuple of plain arrays.
+
+    `advance` is `step` without checks of the sample; it returns the row of numbers from which the estimates are made.
+    """
 
     @abstractmethod
     def init(self) -> State:
@@ -39,7 +41,7 @@ class Observer(ABC, Generic[State, Row]):
 
     @abstractmethod
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
-        """Return the state after a sample, and what is known at it."""
+        """Return the state after a sample, and the row of numbers at it."""
 
     @abstractmethod
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
@@ -63,9 +65,9 @@ class Observer(ABC, Generic[State, Row]):
 
 
 class StepObserver(Observer[Any, Any]):
-    """An observer of states and parameters, which takes missing samples itself and states deviations."""
+    """An observer of states and parameters with standard deviations, which accepts missing samples."""
 
-    plant: Any  # what it runs on
+    plant: Any  # the plant whose states it estimates
     outliers: Outliers
     outlier_limit: float | None
     outlier_sizes: FloatArray | None
@@ -80,7 +82,7 @@ class StepObserver(Observer[Any, Any]):
         object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: what follows from it is made there anew."""
+        """Return the fields alone for another process, where everything else is computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     @property
@@ -122,13 +124,13 @@ class StepObserver(Observer[Any, Any]):
     @property
     @abstractmethod
     def _steps(self) -> Any:
-        """What follows from the observer alone, made once for all runs: a state `first`, and `advance`."""
+        """The part that is computed once for all runs: the initial state `first`, and `advance`."""
 
     def _allow(self, state: Any) -> None:
-        """Raise where no sample can follow."""
+        """Raise an error if no further sample is possible after a state."""
 
     def _trust(self, row: Any) -> None:
-        """Raise where a step cannot be trusted, and does not say so itself."""
+        """Raise an error if the result of a step cannot be trusted."""
 
     @abstractmethod
     def _sample(self, state: Any, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -139,7 +141,7 @@ class StepObserver(Observer[Any, Any]):
         """Return the estimates of one sample."""
 
     def within_bounds(self, row: Any) -> Any:
-        """Return a row as it is shown, within the bounds of the states."""
+        """Return a row with its states within their bounds, for output."""
         return row
 
     def init(self) -> Any:
@@ -147,14 +149,16 @@ class StepObserver(Observer[Any, Any]):
         return self.timing.begun(self._steps.first)
 
     def advance(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Return the next state and what is known at a sample, without checking it (``y (ny,)``, ``u (nu,)``)."""
+        """Return the state after a sample and the row at it, without checks (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.within_bounds(row)
 
     def accept(self, state: Any, y: FloatArray, u: FloatArray, after_step: AfterStep | None = None) -> tuple[Any, Any]:
-        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``).
+        """Return the same as `advance`, but raise an error for a step that cannot be trusted.
 
-        ``after_step`` is called for each sample whose values are all of its own time: see `AfterStep`."""
+        ``after_step`` (`AfterStep`) is called after each step, also after steps that are repeated when late values
+        arrive.  All values of a step belong to the same time.
+        """
         after, row = self.timing.advance(partial(self._in_order, after_step), state, y, u)
         return after, self.within_bounds(row)
 
@@ -179,9 +183,9 @@ class RunningObserver(Generic[State, Row]):
     Parameters
     ----------
     observer : LinearObserver, RecursiveObserver or DAEObserver
-        What runs.
+        The observer.
     state : NamedTuple, optional
-        Where to begin; ``observer.init()`` by default.
+        The initial state; ``observer.init()`` by default.
 
     Examples
     --------
@@ -207,8 +211,8 @@ class RunningObserver(Generic[State, Row]):
         y : array_like
             Outputs ``(ny,)``.  Recursive and nonlinear observers take NaN for a missing one.
         u : array_like, optional
-            Known inputs ``(nu,)``.  Recursive and nonlinear observers take NaN for one that is missing after the first
-            sample: it counts as it last was, and deviations grow by what its past changes let it be off by.
+            Known inputs ``(nu,)``.  Recursive and nonlinear observers accept NaN for a missing one after the first
+            sample: its last value is used, and deviations grow according to its past changes.
 
         Raises
         ------
@@ -219,13 +223,13 @@ class RunningObserver(Generic[State, Row]):
         SolverError
             The step has no solution (nonlinear observers).
 
-        Whatever is raised, the state is left as it was.
+        After an error the state is unchanged.
         """
         self.state, estimates = self.observer.step(self.state, y, u)
         return estimates
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> Row:
-        """Take one sample without checking it; return what is known at it.
+        """Take one sample without checks, and return the row of numbers at it.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The clock of a log: which sample a row is, by its stamp; rows that are missing, stale or of another interval."""
+"""The clock of a log: the sample of each row by its time stamp; missing, stale and irregular rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.monitoring.logs.stamps import UNITS_OF_TIME
 
-#: Rows whose stamps do not rise: they are left out, and say nothing.
+#: Statuses of rows whose stamps do not increase; these rows are left out.
 REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
 
 STALE = (REPEATED_STAMP, OUT_OF_ORDER)
@@ -17,60 +17,65 @@ STALE = (REPEATED_STAMP, OUT_OF_ORDER)
 #: Gaps longer than this many samples are not bridged: the observer starts again.
 LONGEST_BRIDGE = 10_000
 
-#: A sampled design takes a stamp as the sample that it is nearest to: it is off by up to this share of dt.
+#: A sampled design assigns a stamp to the nearest sample; it may differ from it by at most this share of dt.
 STAMP_SHARE = 0.45
 
-#: Continuous designs: a gap of so little more than a number of intervals has no further row in it.
+#: In continuous designs, a gap that exceeds a whole number of intervals by this share has no further missing row.
 COUNTING_SHARE = 0.01
 
-#: What remains of a deviation from the samples in the next one: a clock that is a little fast is followed.
+#: Share of the difference between stamp and sample that is left in the next one, so that a fast or slow clock is
+#: followed.
 FOLLOWING_SHARE = 0.9
 
-#: Stamps that are this far from the samples on average are of another sampling time; the average takes this share of
-#: each new row, and begins with nothing.
+#: Stamps whose mean difference from the samples is above this share of dt belong to another sampling time.  The mean is
+#: exponential with the second number as the weight of a new row, and starts at zero.
 OTHER_SHARE, AVERAGED_SHARE = 0.25, 0.05
 
-#: So many rows in a row whose stamps do not rise are no slip of a clock.
+#: More consecutive rows than this whose stamps do not increase are an error.
 MOST_STALE = 10
 
-#: One that differs by this share of dt is one of dt for certain.
+#: An interval that differs from dt by at most this share certainly has no missing rows.
 SURE_SHARE = 0.009
 
-#: Of uneven stamps one that differs by more than this is another interval.
+#: If stamps are uneven, an interval that differs from dt by more than this share is one of its own.
 SAME_INTERVAL = 1e-9
 
-#: Without another word, an interval is a gap when it is longer than this many times the longest one before.
+#: By default, an interval is a gap if it is longer than so many times the longest one before.
 GAP_FACTOR = 10.0
 
 #: A gap of more samples than this cannot be counted in double precision.
 MOST_COUNTED_SAMPLES = 2.0**53
 
 
-#: An interval is taken for one in another unit where it is off that by this share at most, as stamps jitter.
+#: An interval may be one in another unit if it differs from that by at most this share, since stamps jitter.
 UNIT_SHARE = 0.05
 
-#: What mends a log whose time falls for good.
+#: Remedy for a log whose time decreases.
 SORTED = "Sort the log by its time; if logs were joined, give each by itself"
 
 
 def unit_advice(samples: float) -> str:
-    """Return what helps where rows are so many samples apart as they are with stamps in another unit than seconds, as a
-    sentence with a blank before it; empty where no unit fits."""
+    """Return a sentence on the unit of the stamps, with a blank before it; empty if no other unit than seconds fits.
+
+    ``samples`` is the interval between rows in samples of the design.
+    """
     others = {unit: size for unit, size in UNITS_OF_TIME.items() if size != 1.0}
     fits = [unit for unit, size in others.items() if abs(samples / size - 1.0) <= UNIT_SHARE]
     return f" If the stamps are in {fits[0]}, call their column 'time [{fits[0]}]'." if fits else ""
 
 
 class StampError(SpecError):
-    """A stamp that comes before the one of an earlier row."""
+    """A stamp that is earlier than that of the row before."""
 
     def __init__(self, message: str, row: int, last: float, time: float) -> None:
         super().__init__(message, path=f"row {row}")
         self.row, self.last, self.time = row, last, time
 
     def dated(self, date_of: Callable[[float], str], *, is_autumn: bool) -> str:
-        """Return the message with dates as the log writes them, and what mends it; ``is_autumn``: dates without a zone
-        have fallen as clocks do then."""
+        """Return the message with dates in the format of the log, and the remedy.
+
+        ``is_autumn``: the time decreases as at the end of daylight saving, in dates without a time zone.
+        """
         mend = (
             "Clocks go back like this in autumn, and the stamps name no time zone: state it (time_zone, --time-zone "
             "Europe/Berlin), or sort the log by its time"
@@ -81,39 +86,44 @@ class StampError(SpecError):
 
 
 class Clock:
-    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds;
-    ``why``: why a recursive design takes no other interval than dt."""
+    """Checks time stamps one after another.
+
+    ``dt`` is 0 in continuous time, where an interval longer than ``gap`` seconds is a gap.  ``why`` is the reason why a
+    recursive design accepts no other interval than dt.
+    """
 
     def __init__(self, dt: float, gap: float | None, *, irregular: bool = False, why: str = "") -> None:
         self.dt, self.gap, self.irregular, self.why = dt, gap, irregular, why
-        # Sampled designs that take any interval: whether the last one was taken as it is, and by how many seconds
-        # such intervals have been longer than dt.
+        # For sampled designs that accept any interval: whether the last interval was an irregular one, the sum of the
+        # differences of such intervals from dt, and whether stamps are uneven.
         self.is_own, self.longer, self.is_uneven = False, 0.0, False
-        # Sampled designs: the time of the last sample, near which its stamp lies.
+        # Time of the last row; for sampled designs that of its sample, near its stamp.
         self.last: float | None = None
         self.longest = 0.0
         self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
-        # Of sampled designs: the number of the last sample, from that of the first row.
+        # For sampled designs: number of the last sample, counted from the first row.
         self.count = 0
-        self.is_resumed = False  # and no row has been taken since
+        self.is_resumed = False  # whether no row has been taken since the run was resumed
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what goes from row to row, as data."""
+        """Return the state between rows as data."""
         state = {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
         return state | ({"longer": self.longer, "is_uneven": self.is_uneven} if self.irregular else {})
 
     def resume(self, data: Mapping[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
+        """Restore the state from the data that `as_dict` returned."""
         vars(self).update(data)
         self.is_resumed = True
 
     def at(self, time: float, before: int = 0) -> float:
-        """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
-        samples, whatever their stamps are off by."""
+        """Return the time of the last sample, whose stamp is ``time``, or of the one ``before`` samples earlier.
+
+        Sampled designs count samples, so that the jitter of stamps does not matter.
+        """
         return (self.count - before) * self.dt + self.longer if self.dt > 0.0 else time
 
     def advance(self, time: float, row: int) -> tuple[float, int]:
-        """Take the stamp of the next row."""
+        """Take the stamp of the next row; return the seconds and the number of missing rows since the row before."""
         if not math.isfinite(time):
             raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
         last = self.last
@@ -142,7 +152,7 @@ class Clock:
         self.count += missing + 1
         if self.dt > 0.0 and not self.is_own:
             away = step - (missing + 1) * self.dt
-            # Regular stamps are taken as they are, and not as they are summed up.
+            # Regular stamps are used directly, so that rounding does not accumulate.
             self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
         self.stamp, self.left_out, self.is_resumed = time, 0, False
         if not missing:
@@ -150,12 +160,14 @@ class Clock:
         return step, missing
 
     def stale(self, time: float) -> str:
-        """Return the status of a row whose stamp does not rise, which is left out; empty for others. A run that goes on
-        from a saved state may begin with the rows that the state has, however many they are."""
+        """Return the status of a row whose stamp does not increase, which is left out; empty for other rows.
+
+        A run that continues from a saved state may begin with any number of rows from before that state.
+        """
         last = self.last
         if last is None or not math.isfinite(time) or (self.left_out >= MOST_STALE and not self.is_resumed):
             return ""
-        # Of a sampled design the last sample may be reported a little later than its stamp.
+        # In a sampled design the last sample may be reported again with a slightly later stamp.
         before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last
         if time > before and time != last:
             return ""
@@ -163,15 +175,15 @@ class Clock:
         return REPEATED_STAMP if time in (self.stamp, last) else OUT_OF_ORDER
 
     def regular(self, times: Sequence[float]) -> list[float]:
-        """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
-        taken."""
+        """Return the intervals to the first of these stamps, as far as they certainly have no gaps between them; the
+        clock does not change."""
         steps: list[float] = []
         if self.last is None or not self.longest > 0.0:
             return steps
         before, longest = self.last, GAP_FACTOR * self.longest if self.gap is None else self.gap
         lowest, highest = 0.0, longest
         if self.dt > 0.0:
-            # Narrower than what fits, so that no rounding of an interval counts.
+            # Narrower limits than those of `advance`, so that rounding of an interval does not matter.
             lowest, highest = (1.0 - SURE_SHARE) * self.dt, (1.0 + SURE_SHARE) * self.dt
         for time in times:
             step = interval(before, time) if time > before and time < math.inf else 0.0
@@ -182,14 +194,17 @@ class Clock:
         return steps
 
     def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
-        """Take stamps that `regular` found to follow each other, with their intervals."""
+        """Take stamps for which `regular` has returned the intervals ``steps``."""
         self.last, self.longest = times[-1], max(self.longest, *steps)
         self.stamp, self.left_out, self.away = times[-1], 0, 0.0
         self.count += len(times)
 
     def _is_irregular(self, step: float) -> bool:
-        """Whether an interval is taken as it is: it is near dt, but not dt; or the stamps are uneven: this one, or one
-        before, is no number of samples with rows missing between them. A gap is none of these."""
+        """Whether an interval is an irregular one, over which the design takes one step.
+
+        Such an interval is near dt, but differs from it; or the stamps are uneven, so that this interval or one before
+        is no whole number of samples.  Gaps are not irregular intervals.
+        """
         samples = step / self.dt
         if samples > LONGEST_BRIDGE:
             return False
@@ -198,7 +213,7 @@ class Clock:
         if count == 1:
             self.is_uneven = self.is_uneven or away > STAMP_SHARE
             return away > (SAME_INTERVAL if self.is_uneven else SURE_SHARE)
-        # Rows are missing only where some have come one after the other.
+        # Rows can only be missing if intervals of about dt have occurred.
         fits = away <= (OTHER_SHARE if self.longest else SURE_SHARE) and (self.longest > 0.0 or not self.count)
         self.is_uneven = self.is_uneven or not fits
         return self.is_uneven
@@ -236,7 +251,7 @@ class Clock:
 
 
 def _counted(samples: float, step: float, row: int) -> int:
-    """Return a whole number of samples; more than can be counted are no gap but a mistake."""
+    """Return a whole number of samples; raise `SpecError` for more than can be counted, which are a mistake."""
     if not samples < MOST_COUNTED_SAMPLES:
         raise SpecError(
             f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",

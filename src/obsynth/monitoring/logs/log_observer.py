@@ -22,10 +22,10 @@ OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "reco
 #: A row in which a scheduling parameter is outside its region, or was so recently that nothing is claimed yet.
 OUT = "out"
 
-#: Rows in which a decision may be taken.
+#: Statuses of rows that may be decided.
 DECIDING = (OK, PARTIAL)
 
-#: Waiting without dt ends with a row that so many roundings call earlier.
+#: In continuous time a waiting period ends with a row that is earlier than its end by at most so many roundings.
 SETTLING_ULPS = 4.0
 
 
@@ -35,38 +35,40 @@ class Row(NamedTuple):
     status: str  # ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering`` or ``out``
     values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
     skipped: int = 0  # rows missing before this one for which the observer has no row of its own
-    evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
+    evidence: Evidence | LinearSample | None = None  # the observer's own row, for decisions
     settled: bool = True  # whether the effects of gaps have decayed, so that guaranteed bounds hold
-    # Bound on what a gap has left in each value of a row that is recovering, if the model's error in the gap was never
-    # larger than at its end; infinite where that is not known.
+    # Bound on the effect of a gap on each value of a recovering row, if the model's error in the gap was never larger
+    # than at its end; infinite where it is unknown.
     excess: FloatArray | None = None
     bridged: bool = False  # whether the plant's model replaced every missing sample since the warm-up
-    # By how many times fault estimates are less certain than before samples were missing ``(nf,)``; ``None``: no less.
+    # Factor of the standard deviations of fault estimates by missing samples ``(nf,)``; ``None``: one.
     unsure: FloatArray | None = None
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
-    at: float = math.nan  # the time of its sample since the first one; of continuous designs that of its stamp
-    # How many samples in a row of each output have been equal ``(ny,)``, where a monitor has learned how many may be.
+    at: float = math.nan  # time of its sample since the first one; for continuous designs that of its stamp
+    # Number of equal consecutive samples of each output ``(ny,)``, if a monitor has learned the usual number.
     repeated: FloatArray | None = None
-    # Rows of a sampled design that were missing before this one: as the observer went through them, without signals.
+    # The missing rows of a sampled design before this one, as the observer processed them, without signals.
     missed: tuple[Row, ...] = ()
 
 
 class LogObserver(ABC):
-    """The observer of a design on rows of a log: what it reads and estimates, and its state from row to row. Samples
-    that are missing are its business, time stamps are that of the run."""
+    """The observer of a design on the rows of a log, with its signals, its estimates and its state between rows.
 
-    input_names: tuple[str, ...]  # what is read from each row, in order
+    It handles missing samples; the run handles time stamps.
+    """
+
+    input_names: tuple[str, ...]  # the signals that are read from each row, in order
     output_names: tuple[str, ...]
     columns: tuple[str, ...]  # of estimates: states and faults first
     point: Mapping[str, float] = MappingProxyType({})  # operating point by name of the signal
     scales: Mapping[str, float] = MappingProxyType({})  # factor of inputs and outputs by name
-    notes: tuple[str, ...] = ()  # what a user should know before anything is run
+    notes: tuple[str, ...] = ()  # notes for the user before a run
     plant: DescriptorSystem | None = None  # of a linear design
-    takes_any_interval: bool = False  # of a sampled design: each step from the continuous plant, over its own interval
-    own_intervals_only: str = ""  # of a recursive design that does not: why
-    input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
-    saved: ClassVar[Mapping[str, str]] = {}  # attributes that go from row to row, by their names in a saved state
+    takes_any_interval: bool = False  # whether a sampled design can step over any interval, by its continuous plant
+    own_intervals_only: str = ""  # the reason why a recursive design cannot do so
+    input_delay: int = 0  # rows of a log by which inputs act later than in the design
+    saved: ClassVar[Mapping[str, str]] = {}  # attributes that form the state, by their names in a saved state
 
     def __init__(self, observer: Any, warm_up: float | None, default_warm_up: float) -> None:
         self.state_names, self.fault_names = observer.state_names, observer.fault_names
@@ -83,7 +85,8 @@ class LogObserver(ABC):
 
     @property
     def lags(self) -> list[tuple[str, int]]:
-        """Name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
+        """Names and delays in samples of lagging estimates: the states (together if their delays are equal), and each
+        fault."""
         delays = list(zip(self.estimated, (*self.state_delays, *self.fault_delays), strict=True))
         if len(set(self.state_delays)) == 1:
             delays[: len(self.state_names)] = [("xhat", self.state_delays[0])]
@@ -91,39 +94,52 @@ class LogObserver(ABC):
 
     @abstractmethod
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
-        """Take one row: its time (of a sampled design that of its sample), deviations ``(nu + ny,)``, how many seconds
-        and missing rows are between it and the row before, and the longest interval so far."""
+        """Process one row, and return its estimates.
+
+        Parameters
+        ----------
+        time : float, seconds
+            Time of the row; for a sampled design that of its sample.
+        values : FloatArray
+            Deviations ``(nu + ny,)`` from the operating point.
+        seconds : float
+            Time since the row before.
+        missing : int
+            Number of missing rows since the row before.
+        longest : float, seconds
+            Longest interval between rows so far.
+        """
 
     def follows(self, missing: int) -> bool:
-        """Whether rows that are missing are taken one by one, as if they stood in the log without signals."""
+        """Whether missing rows are processed one by one, as rows of the log without signals."""
         return self.dt > 0.0 and missing <= LONGEST_BRIDGE
 
     def _after(self, time: float, seconds: float) -> float:
-        """Return from when on ``seconds`` after a time are over."""
+        """Return the time at which ``seconds`` after a time have passed, less a tolerance for rounding."""
         slack = SETTLING_SLACK * self.dt if self.dt > 0.0 else SETTLING_ULPS * math.ulp(abs(time) + seconds)
         return time + seconds - slack
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what a run should say of the observer once it has ended."""
+        """Return the warnings of a run on the observer, at its end."""
         return ()
 
     @property
     def takes_pieces(self) -> bool:
-        """Whether `take_piece` can go on from where the observer is."""
+        """Whether `take_piece` can process the next rows."""
         return False
 
     def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
-        """Take rows that follow each other without a gap, ``values (rows, nu + ny)``, or the first of them."""
+        """Process rows without gaps between them, ``values (rows, nu + ny)``, or only the first of these rows."""
         raise NotImplementedError
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the state that goes from row to row, as data."""
+        """Return the state between rows as data."""
         own = {key: getattr(self, name) for key, name in self.saved.items()}
         plain = {key: state_as_data(value) if hasattr(value, "_asdict") else value for key, value in own.items()}
         return {"settled_at": self.settled_at, "phase": self.phase, **self.options, **plain}
 
     def resume(self, data: Mapping[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
+        """Restore the state from the data that `as_dict` returned."""
         if any(data[name] != value for name, value in self.options.items()):
             listed = " or ".join(name.replace("_", "-") for name in sorted(self.options))
             raise SpecError(f"The saved state is of a run with another {listed}: use the same options.", path="state")

@@ -1,4 +1,4 @@
-"""A run over a log: rows of data to rows of output, counts of what happened, and the saved state to resume from."""
+"""A run over a log: from rows of data to rows of output, with alarms, counts and a state that can be saved."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.suggestions import suggestion
 from obsynth.results.design import ObserverDesign
 
-#: What an alarm by a sensor that is stuck is called, before the name of its output.
+#: Name of the alarm of a stuck sensor, before the name of its output.
 STUCK_SENSOR = "stuck sensor"
 
-#: Its column says of which time the recovered states are.
+#: Name in the column with the time of recovered states, if they lag.
 LATE = "recovered states"
 
-#: Rows that are taken in one piece at most.
+#: Largest number of rows that are processed together.
 ROWS_AT_ONCE = 4096
 
 
@@ -51,7 +51,7 @@ def damaged_state(path: Path) -> SpecError:
 class LogRun:
     """A design over a log, from its start: rows of data to estimates (`read`), and to rows of output (`take`).
 
-    ``thresholds`` are levels by column; ``recovered`` is which states of the plant as written stand beside the others;
+    ``thresholds`` are levels by column; ``recovered`` selects states of the original plant that are returned as well;
     other options are those of `run_on_data`.
     """
 
@@ -70,9 +70,9 @@ class LogRun:
         stamps: Stamps | None = None,
         units_as_is: bool = True,
     ) -> None:
-        #: Of thresholds that were learned: what leaves out the samples of sensors that may be stuck.
+        #: For learned thresholds: removes the samples of sensors that may be stuck.
         self.unrepeated: Unrepeated | None = None
-        #: Of these: in which rows inputs and outputs are beyond their learned ranges.
+        #: For learned thresholds: records rows with inputs and outputs beyond their learned ranges.
         self.beyond: RowsBeyond | None = None
         if monitor is not None and isinstance(monitor.rule, LearnedRule):
             learned = monitor.rule.learned
@@ -83,7 +83,7 @@ class LogRun:
         self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval, why=observer.own_intervals_only)
         self.signals = LogSignals.of(observer, columns, scales, getattr(design.plant, "units", {}))
         self.stamps, self.monitor = stamps, monitor
-        #: What rows wait in for those after them, if they do.
+        #: Smoother in which rows wait for later ones, if there is one.
         self.later: Any = None
         self._watching: Any = None if monitor is None else monitor.init()
         self.recovered = RecoveredStates.of(design.recovery, observer, recovered)
@@ -114,7 +114,7 @@ class LogRun:
         self._shifts = self._shifts_of_intervals()
         self.first, self.rows = OperatingPointCheck(self.signals), 0
         self.units = None if units_as_is else UnitCheck(design, self.signals)
-        #: The file of the state that the first rows go on from: only they show whether its parts fit together.
+        #: File of the state that the run continues from, until the first rows have shown that its parts fit together.
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
         self.alarm_rows = dict[str, int]()
@@ -122,7 +122,7 @@ class LogRun:
         self.repeated = RepeatedValues(len(observer.output_names))
 
     def _shifts_of_intervals(self) -> FloatArray:
-        """Return what is added to the columns of the monitor: intervals of faults are in the units of the estimates."""
+        """Return the operating point of the monitor's columns, which is nonzero for intervals of faults."""
         point = dict(zip(self.observer.fault_names, self._point[self._faults].tolist(), strict=True))
         ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
         return np.array([ends.get(name, 0.0) for name in (() if self.monitor is None else self.monitor.columns)])
@@ -141,7 +141,7 @@ class LogRun:
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         if self.later is None:
             return self._rows_out(self.read(chunk))
-        # What waits for a row is smoothed by it before the next one is taken.
+        # A row that waits for later ones is smoothed with each of them before the next one is read.
         return self._rows_out(
             [ready for row in chunk for took in self.read(row[None]) for ready, *_ in self.later.take(took)]
         )
@@ -154,8 +154,8 @@ class LogRun:
         return self.estimates(chunk[:, 0].tolist(), deviations)
 
     def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
-        """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
-        rise are left out."""
+        """Return the estimates at rows with deviations ``values (rows, nu + ny)``; rows whose stamps do not increase
+        are left out."""
         rows, at, read = list[Row](), list[float](), values
         values, memory = self._unrepeated_rows(times, values)
         complete = np.asarray(np.isfinite(values).all(axis=1))
@@ -191,8 +191,8 @@ class LogRun:
         ]
 
     def _unrepeated_rows(self, times: Sequence[float], values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """Return rows ``(rows, nu + ny)`` without what sensors repeat that may be stuck, and what is remembered of that
-        after each."""
+        """Return rows ``(rows, nu + ny)`` without repeated values of sensors that may be stuck, and the memory of
+        repeated values after each row."""
         if self.unrepeated is None or not len(values):
             return values, None
         nu = values.shape[1] - len(self.unrepeated.longest)
@@ -201,12 +201,12 @@ class LogRun:
         return np.hstack([values[:, :nu], outputs]), memory
 
     def _remember(self, memory: FloatArray | None, done: int) -> None:
-        """Keep what is remembered after so many rows of a piece."""
+        """Set the memory of repeated values to that after ``done`` rows."""
         if self.unrepeated is not None and memory is not None:
             self.unrepeated.memory = memory[done - 1]
 
     def _single(self, time: float, values: FloatArray, number: int) -> Row:
-        """Take one row; one that is refused leaves nothing behind, so that a run may go on after it."""
+        """Process one row; an error leaves the state unchanged, so that the run may continue after it."""
         parts = (self.observer, self.clock)
         before = [dict(vars(part)) for part in parts]
         try:
@@ -232,7 +232,7 @@ class LogRun:
             raise
 
     def _missed(self, time: float, missing: int) -> Iterator[Row]:
-        """Take rows of a sampled design that are missing before one, as if they stood in the log without signals."""
+        """Process the missing rows of a sampled design before a row, as rows of the log without signals."""
         nothing = np.full(len(self.signals.names), np.nan)
         for before in range(missing, 0, -1):
             at = self.clock.at(time, before)
@@ -240,7 +240,7 @@ class LogRun:
             yield row._replace(time=time, deviations=nothing, at=at)
 
     def finish(self) -> list[list[Any]]:
-        """Return the rows of output that waited for what does not come any more."""
+        """Return the rows of output that still waited for later rows."""
         if self.units is not None:
             self.units.finish()
         return [] if self.later is None else self._rows_out([ready for ready, *_ in self.later.flush()])
@@ -266,7 +266,7 @@ class LogRun:
         return rows
 
     def _inputs_beyond(self, taken: Sequence[Row], first: int) -> list[tuple[str, ...]]:
-        """Return for rows, of which the first one has this number, which inputs are beyond their learned ranges."""
+        """Return the inputs beyond their learned ranges in each row; the first row has the number ``first``."""
         if self.beyond is None:
             return [()] * len(taken)
         nothing = np.full(len(self.signals.names), np.nan)
@@ -274,7 +274,7 @@ class LogRun:
         return self.beyond.take(np.array(read), first)
 
     def _outputs_of(self, row: Row) -> FloatArray:
-        """Return what was measured of the outputs ``(ny,)``, nothing in a row that is left out."""
+        """Return the measured outputs ``(ny,)``, NaN in a row that is left out."""
         count = len(self.observer.output_names)
         if row.deviations is None or row.status in STALE:
             return np.full(count, np.nan)
@@ -290,8 +290,10 @@ class LogRun:
     def _decided(
         self, row: Row, values: FloatArray, number: int, before: Sequence[Any], beyond: tuple[str, ...]
     ) -> list[Any]:
-        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``before``: other cells;
-        ``beyond``: inputs for which levels are raised."""
+        """Return the cells of the monitor, if there is one, and of alarms, and record the alarms.
+
+        ``before`` are the other cells of the row, and ``beyond`` the inputs for which levels are raised.
+        """
         time = row.time
         if row.status in STALE:
             self.events.silent[row.status] += 1
@@ -328,7 +330,7 @@ class LogRun:
                 self.isolated = self.isolated or output.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 since = self.events.shelved_since(kind)
-                # What is as likely as another is not named, but the others are excluded.
+                # If several causes are equally likely none is named, but the others are excluded: list these.
                 candidates = "" if output.ranking is None else output.ranking.candidates
                 fault_text = output.fault or candidates if math.isnan(since) else SHELVED.format(self._time_text(since))
                 names.append(f"{kind}: {fault_text}" if fault_text else kind)
@@ -345,7 +347,7 @@ class LogRun:
         return [*cells, "; ".join(names)]
 
     def taken_for_usual(self) -> tuple[str, ...]:
-        """Return a text where an alarm of learned thresholds ended as it had stood since the start."""
+        """Return a text if an alarm of learned thresholds was ended since it was present from the start on."""
         if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule) or not self._watching.rule.ended:
             return ()
         logs = logs_that_do(self.monitor.rule.learned.logs, joined=", which")
@@ -358,7 +360,7 @@ class LogRun:
         )
 
     def _raised_by_start(self) -> str:
-        """Return how far levels are raised by an alarm that stood since the start; nothing where they are not."""
+        """Return a text on the factor of levels after an alarm from the start on was ended; empty if it is one."""
         room = self._watching.rule.room
         if room <= 1.0:
             return ""
@@ -368,7 +370,7 @@ class LogRun:
         )
 
     def swinging(self) -> tuple[str, ...]:
-        """Return a text where levels of learned thresholds were raised, as residuals swing to both sides."""
+        """Return a text if levels of learned thresholds were raised since residuals swing to both sides."""
         if self.monitor is None or not isinstance(self.monitor.rule, LearnedRule):
             return ()
         swings = self._watching.rule.swings
@@ -386,7 +388,7 @@ class LogRun:
         return f"{time:.15g}" if self.stamps is None else self.stamps.shown(time)
 
     def _stuck(self, row: Row) -> list[tuple[str, float]]:
-        """Return the alarms of sensors that have been stuck for long, with the share of their threshold."""
+        """Return the alarms of sensors that have been stuck for long, with the ratios to their thresholds."""
         if self.unrepeated is None or row.repeated is None:
             return []
         shares = row.repeated / (self.unrepeated.longest + STUCK_ALARM_ROWS)
@@ -394,7 +396,7 @@ class LogRun:
         return [(f"{STUCK_SENSOR} {name}", share) for name, share in by_output if share > 1.0]
 
     def _sample(self, monitor: Monitor, row: Row) -> Sample:
-        """Return what a monitor takes of a row."""
+        """Return the input of a monitor for a row."""
         deciding = row.status in DECIDING and (row.settled or not monitor.guarantees)
         if monitor.rule.bridges and row.bridged:
             deciding = row.status in (*DECIDING, RECOVERING)
@@ -403,12 +405,12 @@ class LogRun:
         return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged, inputs)
 
     def _share(self, row: Row, column: int) -> float:
-        """Return by how many times a level is higher than stated: as less certain as a fault estimate is."""
+        """Return the factor of a level: that of the deviation of a fault estimate by missing samples."""
         place = column - self._faults.start
         return 1.0 if row.unsure is None or not 0 <= place < len(row.unsure) else float(row.unsure[place])
 
     def _excess(self, row: Row, column: int) -> float:
-        """Return by how much more than its level a column must be for an alarm: infinite where nothing is decided."""
+        """Return by how much a column must exceed its level for an alarm: infinite where nothing is decided."""
         if row.status in DECIDING:
             return 0.0
         if row.status != RECOVERING or row.excess is None or column >= len(row.excess):
@@ -416,7 +418,8 @@ class LogRun:
         return float(row.excess[column])
 
     def _evidence(self, row: Row) -> Any:
-        """Return what was learnt from a row; of one with missing samples, to who takes these, what there is."""
+        """Return the observer's row for a monitor; if samples are missing, the values that exist, for monitors that
+        accept gaps."""
         if row.evidence is not None or self.monitor is None or not self.monitor.rule.takes_gaps:
             return row.evidence
         nu, deviations = len(self.observer.input_names), row.deviations
@@ -425,8 +428,8 @@ class LogRun:
         return LinearSample(row.values, deviations[:nu], deviations[nu:], len(self.observer.state_names))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the state that goes from row to row, as data."""
-        # Designs without such inputs have states as they always had.
+        """Return the state between rows as data."""
+        # Only designs with derivatives of inputs have this part.
         latest = None if self.stamps is None else [[i, *row] for i, row in self.stamps.differenced.items()] or None
         return {
             **({"differenced": latest} if self.signals.has_derivatives else {}),
@@ -441,7 +444,7 @@ class LogRun:
         }
 
     def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
+        """Restore the state from the data that `as_dict` returned."""
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
         if (data.get("repeated") is None) != (self.unrepeated is None):
@@ -462,12 +465,12 @@ class LogRun:
             self.recovered.resume(data["recovered"])
         if self.monitor is not None:
             self._watching = self.monitor.from_data(data["monitor"])
-        # Its first rows were judged when they came.
+        # Units were checked in the first rows of the run.
         self.units = None
 
 
 def _levels(thresholds: Mapping[str, float], names: Sequence[str]) -> tuple[tuple[str, int, float], ...]:
-    """Return each column with a threshold: its name, its place among all of them, and its level."""
+    """Return the name, the position and the level of each column with a threshold."""
     for name, level in thresholds.items():
         if name not in names:
             raise SpecError(
@@ -479,7 +482,7 @@ def _levels(thresholds: Mapping[str, float], names: Sequence[str]) -> tuple[tupl
 
 
 def _meant(name: str, names: Sequence[str]) -> str:
-    """Return a question with the column that a signal without brackets may mean, or one of a like name."""
+    """Return a question on the column that a signal without brackets may mean, or on one with a similar name."""
     of_signal = [column for column in names if column.endswith(f"[{name}]")]
     return f" Did you mean {' or '.join(map(repr, of_signal))}?" if of_signal else suggestion(name, names)
 
@@ -487,8 +490,8 @@ def _meant(name: str, names: Sequence[str]) -> str:
 def faults_on_rows(
     design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them, NaN where there is none; and
-    in which rows a decision may be taken ``(rows,)``."""
+    """Return fault estimates ``(rows, nf)`` on rows of a log as in `run_on_data`, NaN where there are none; and which
+    rows may be decided ``(rows,)``."""
     run = LogRun(design)
     first = len(run.observer.state_names)
     rows = run.estimates(times.tolist(), np.hstack([u, y]))

@@ -1,4 +1,4 @@
-"""Signals of a log: which columns they are in, and their values as deviations from the operating point."""
+"""Signals of a log: their columns, and their values as deviations from the operating point."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from obsynth.numerics.measurement_units import MICRO_SIGNS, conversion
 from obsynth.numerics.suggestions import are_numbers, quoted_names, suggestion, there_are
 from obsynth.plants.input_derivatives import derivative_name, derivative_of
 
-#: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
+#: A time of day without a date, whose date is in another column; hours, minutes and seconds since the start of a log.
 _TIME_OF_DAY = re.compile(
     r"\d{1,2}:\d{2}(?::\d{2}\S*)?(?:\s*[AaPp]\.?[Mm]\.?)?(?:\s*(?:UTC|GMT|Z|[+-]\d\S*))?", re.IGNORECASE
 )
@@ -29,20 +29,20 @@ _TIME_OF_DAY = re.compile(
 #: The column of time stamps, in seconds.
 TIME_HEADER = "time"
 
-#: How the column of dates beside times of day may be called; that of a status beside a value, or behind its name.
+#: Names of a column of dates beside times of day, and names or endings of names of a column with the status of values.
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha")
 
 _STATUS_NAMES = ("status", "quality")
 
-#: How a status begins that says that a value is bad.
+#: Beginnings of a status of bad values.
 _BAD_STATUS = ("bad", "invalid", "not good")
 
-#: How columns of time stamps are often called; a column of dates stands beside one of times of day.
+#: Usual beginnings of the names of columns of time stamps, in the order in which they are suggested.
 _TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")
 
 
 class HeaderUnit(NamedTuple):
-    """The unit that a log states of a column, and what makes values in the plant's unit of it."""
+    """The unit of a column in the header of a log, and the conversion to the plant's unit."""
 
     unit: str
     factor: float
@@ -51,7 +51,7 @@ class HeaderUnit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LogSignals:
-    """Which column holds which measured signal, and how its values become deviations."""
+    """The columns of measured signals, and the conversion of their values to deviations."""
 
     names: tuple[str, ...]  # signals: known inputs, then outputs
     columns: tuple[str, ...]  # the columns that are read: time, then one for each signal
@@ -60,8 +60,8 @@ class LogSignals:
     point: Mapping[str, float]  # the operating point
     constant_signal: int | None = None  # number of the signal that is 1 in every row and has no column, if there is one
     inputs: int = 0  # columns of known inputs
-    delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
-    units: Mapping[str, str] = field(default_factory=dict)  # of signals whose factor nobody states
+    delay: int = 0  # rows by which inputs act later than in the design; negative: earlier
+    units: Mapping[str, str] = field(default_factory=dict)  # of signals without a stated factor
     in_header: dict[str, HeaderUnit] = field(default_factory=dict)  # by signal; filled in when a header is read
 
     @classmethod
@@ -92,7 +92,7 @@ class LogSignals:
         scaled = {*factors, *observer.scales}
 
         def base_of(name: str) -> str | None:
-            # A derivative has the factor of its input where it states none.
+            # A derivative without a factor of its own has that of its input.
             base = derivative_of(name, observer.input_names) if name in observer.input_names else None
             return None if base is None else base[0]
 
@@ -110,14 +110,14 @@ class LogSignals:
 
     @property
     def has_derivatives(self) -> bool:
-        """Whether a signal is the derivative of a known input, which a run may form."""
+        """Whether a signal is the derivative of a known input, which a run may compute from its samples."""
         return any(derivative_of(name, self.names) for name in self.names)
 
     def conversions(
         self, header: Sequence[str], places: Sequence[int], stamps: Stamps, below: Sequence[str] = ()
     ) -> tuple[FloatArray, FloatArray]:
         """Return factors and shifts ``(columns,)`` from the units in a header, or in the line ``below`` it, to those of
-        the plant; notes of the stamps say what is converted.
+        the plant; conversions are noted in the notes of ``stamps``.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class LogSignals:
         for i, (name, place) in enumerate(zip(names, places[1:], strict=True)):
             base = derivative_of(name, names)
             if base is not None and place == places[1 + names.index(base[0])]:
-                # It is formed from the samples of its input, in the unit of these.
+                # The derivative is computed from the samples of its input, and has their unit.
                 name = base[0]
             behind = WITH_UNIT.fullmatch(header[place])
             unit = below[i + 1].strip("[]() ") if i + 1 < len(below) else "" if behind is None else behind[2]
@@ -162,10 +162,10 @@ class LogSignals:
         return self.measured(rows) - self.offset
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
-        """Return where in a header each column is that is read."""
+        """Return the position in a header of each column that is read."""
         matches = [column_of(header, name) for name in self.columns]
         for i, name in enumerate(self.columns):
-            # A derivative that has no column is formed from that of its input.
+            # A derivative without a column is computed from the column of its input.
             known = self.columns[1 : 1 + self.inputs]
             base = derivative_of(name, known) if matches[i] is None and name in known else None
             matches[i] = matches[i] if base is None else matches[self.columns.index(base[0])]
@@ -182,13 +182,13 @@ class LogSignals:
         return [header.index(name) for name in present]
 
     def columns_and_signals(self) -> list[tuple[str, str]]:
-        """Return each column that is read, but the time, with its signal; several signals may share a column."""
+        """Return each column that is read, except the time, with its signal; several signals may share a column."""
         return list(
             zip(self.columns[1:], (n for i, n in enumerate(self.names) if i != self.constant_signal), strict=True)
         )
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
-        """Return what is added to the columns of estimates: the operating point of states and faults."""
+        """Return the operating point of the columns of estimates, which is added to deviations of states and faults."""
         biases = getattr(getattr(observer, "plant", None), "sensor_faults", ())
         values = [self.point.get(name, 0.0) for name in observer.state_names]
         values += [0.0 if name in biases else self.point.get(name, 0.0) for name in observer.fault_names]
@@ -196,7 +196,7 @@ class LogSignals:
 
 
 def missing_columns(header: Sequence[str], missing: Sequence[str], signals: Mapping[str, str]) -> SpecError:
-    """Return the error for a log without some columns, which are of these ``signals``, or the time."""
+    """Return the error for missing columns of a log; ``signals`` are those of the columns, except the time."""
     column, signal = next(
         ((column, signals[column]) for column in missing if column in signals), (missing[0], TIME_HEADER)
     )
@@ -208,26 +208,28 @@ def missing_columns(header: Sequence[str], missing: Sequence[str], signals: Mapp
 
 
 def _column(name: str, names: Sequence[str], renamed: Mapping[str, str]) -> str:
-    """Return the column of a signal: a derivative goes by that of its input."""
+    """Return the column of a signal; that of a derivative follows from the column of its input."""
     base = derivative_of(name, names)
     return renamed.get(name, name if base is None else derivative_name(renamed.get(base[0], base[0]), base[1]))
 
 
 def _factor(name: str, names: Sequence[str], factors: Mapping[str, float], scales: Mapping[str, float]) -> float:
-    """Return the factor of a column: that of its input for a derivative that states none."""
+    """Return the factor of a column; a derivative without its own has that of its input."""
     base = derivative_of(name, names)
     default = 1.0 if base is None else factors.get(base[0], scales.get(base[0], 1.0))
     return factors.get(name, scales.get(name, default))
 
 
 def is_bad(status: str) -> bool:
-    """Whether the text of a status says that the value beside it is bad."""
+    """Whether a status means that the value is bad."""
     return status.strip().lower().startswith(_BAD_STATUS)
 
 
 def column_of(header: Sequence[str], name: str) -> str | None:
-    """Return what a header calls a column: as it is called, in whatever code points, or so with a unit in brackets
-    behind it; `None` where no column, or more than one of the latter, is called so."""
+    """Return the name of a column in a header, or `None` if there is none or several.
+
+    The name may be encoded with other code points, or be followed by a unit in brackets.
+    """
     if name in header:
         return name
     name = _one_spelling(name)
@@ -243,25 +245,28 @@ def column_of(header: Sequence[str], name: str) -> str | None:
 
 
 def _one_spelling(name: str) -> str:
-    """Return a name in one of its encodings: letters with their marks as one code point, the sign for micro as mu."""
+    """Return a name in a standard encoding: letters with accents as one code point, the sign for micro as mu."""
     return name if name.isascii() else unicodedata.normalize("NFC", name).replace(*MICRO_SIGNS)
 
 
 def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:
-    """Return where dates stand that times of day, which are the first of the columns that are read, may lack."""
+    """Return the position of a column of dates for times of day without dates; `None` if there is not exactly one."""
     dates = [i for i, name in enumerate(header) if name.strip().lower() in _DATE_NAMES and i not in places]
     return dates[0] if len(dates) == 1 else None
 
 
 def with_date(date: str, text: str) -> str:
-    """Return a time of day with the date beside it; what is none as it is."""
-    # A frame may show midnight behind its dates.
+    """Return a time of day together with its date; other texts are returned unchanged."""
+    # A data frame may print its dates with midnight as the time.
     return f"{date.strip().removesuffix(' 00:00:00')} {text.strip()}" if _TIME_OF_DAY.fullmatch(text.strip()) else text
 
 
 def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | None]:
-    """Return where the status of each column stands that is read ``(1 + nu + ny,)``: a column that is called as it with
-    a word such as ``status`` behind, or right of it by such a word alone."""
+    """Return the position of the status of each column that is read ``(1 + nu + ny,)``.
+
+    The name of such a column is that of the values with a word such as ``status`` appended, or such a word alone in the
+    next column.
+    """
     by_column: list[int | None] = [None]
     lower = [name.strip().lower() for name in header]
     for place in places[1:]:
@@ -278,7 +283,7 @@ def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | No
 
 
 def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: str) -> str:
-    """Return what to do about columns that are missing, such as this one of a signal, or of the time."""
+    """Return advice on missing columns, such as ``column`` of a ``signal`` or of the time."""
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
     if are_numbers(header):
@@ -291,12 +296,12 @@ def _advice(header: Sequence[str], missing: Sequence[str], column: str, signal: 
 
 
 def mapping_advice(signal: str, column: str = "YOUR_COLUMN") -> str:
-    """Return how a signal is mapped to a column, on the command line and in Python, as a sentence."""
+    """Return a sentence on how to map a signal to a column, on the command line and in Python."""
     return f"Map it: --map {shlex.quote(signal)}={shlex.quote(column)}, or columns={{{signal!r}: {column!r}}}."
 
 
 def time_advice(header: Sequence[str]) -> str:
-    """Return how a column that looks like the time is named, as a sentence; empty where none does."""
+    """Return a sentence on how to name the column that may be the time; empty if there is none."""
     time_like = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
     time_like = time_like or next((name for name in header if name.lower() == "t"), None)
     if time_like is None:
