@@ -1,7 +1,7 @@
-"""Default random-walk intensity of a fault: small, but a step shows within the plant's settling time.
+"""Default random-walk intensity of a fault: the smallest with which a step is estimated within the settling time.
 
-And the deviation against the delay: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C
-M_j`` from the error covariance.
+The deviation as a function of the delay needs one Riccati equation for each intensity: smoothing over L samples reduces
+the error covariance by ``sum_j G_j C M_j``.
 """
 
 from __future__ import annotations
@@ -33,42 +33,43 @@ from obsynth.plants.pencil import shown_modes, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.inequalities import slowest_decay
 
-#: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
+#: If no intensity estimates a step in time, those whose error is larger than the least one by at most this are as good.
 AS_CLOSE = 0.05
 
-#: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
-#: Where no walk shows more, it has so many times as long, this often: the slowest of all would show nothing ever, and
-#: is taken only where rounding hides what faster ones show.
+#: An intensity counts as estimating nothing of a step in time if its error is above the first number; the size of the
+#: error beyond that depends on rounding.  If this is so for all intensities, the time is multiplied by the second
+#: number, at most so many times.  The slowest intensity of all is then taken only if rounding hides the estimates of
+#: faster ones.
 NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
 
-#: A walk that shows a step in time makes at most so many times the noise of the slowest one that shows half of it then:
-#: what sensors that hardly differ show of the rest is not worth more.
+#: An intensity that estimates a step in time may cause at most so many times the noise of the slowest one that
+#: estimates half of it: the rest may depend on small differences between sensors, and is not worth more noise.
 MOST_NOISE = 20.0
 
-#: Default gains move poles whose errors need longer than so many settling times of the plant to decay; where no gain
-#: does so, those of errors that would stay in any run.
+#: Default gains move poles whose errors last longer than so many settling times of the plant; if no gain does so, those
+#: whose errors would remain in any run.
 TOO_SLOW = (20.0, 1e5)
 
-#: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
+#: Decades of the search to both sides of an intensity of the size of the noise, and number of bisections in a decade.
 DECADES, RATE_BISECTIONS = 8, 9
 
-#: From so many states on the walk is looked for with gains that are solved no better than it needs: of ieee39's 150
-#: states these take a third of the time.
+#: From so many states on the intensity is searched with gains that are only as accurate as necessary: for the 150
+#: states of ieee39 this takes a third of the time.
 ROUGH_FROM = 40
 
-#: Five samples of delay that take less than this share off the deviation are not worth a sentence with figures.
+#: If five samples of delay reduce the deviation by less than this share, the sentence has no numbers.
 WORTH_A_DELAY = 0.01
 
-#: What a rough search begins with: no share of noise.
+#: Start of a search with gains of low accuracy.
 NO_GAIN = KalmanGain(np.zeros((0, 0)), (), np.zeros((0, 0)))
 
 
-#: Lags in samples, and walks relative to the middle one.
+#: Lags in samples, and intensities relative to the middle one.
 TRIED_LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
 
 
 def settling_time(plant: DescriptorSystem) -> float:
-    """Return the time in seconds after which a step of a fault should be seen, from the modes that the outputs show."""
+    """Return the time in seconds after which a step of a fault should be estimated, from the observable modes."""
     own = 1.0 / (plant.dt or PlantUnits.of(plant).time)
     shown = shown_modes(plant)
     alive = np.sort(moving_speeds(shown if shown.size else structure_of(plant).finite_eigenvalues, plant.dt, own))
@@ -81,14 +82,14 @@ def settling_time(plant: DescriptorSystem) -> float:
 def default_rates(
     model: FilterModel, seconds: float, *, lag: int, longer: int = MOST_LONGER
 ) -> tuple[FloatArray, KalmanGain]:
-    """Return the slowest walk of all fault models with which steps are seen in time, and its gain."""
+    """Return the smallest random-walk intensities with which steps are estimated in time, and their gain."""
     states = model.drive.shape[1]
     natural = np.max(np.abs(model.estimate[:, model.order :]), axis=0, initial=0.0)
     sizes = np.ones(states)
     for row, size in zip(model.estimate[:, model.order :], model.fault_sizes, strict=True):
         sizes[row != 0.0] = max(float(size), np.finfo(np.float64).tiny)
     noise = max(float(np.max(np.abs(model.M), initial=0.0)), float(np.max(np.abs(model.N), initial=0.0)))
-    noise = noise or 1.0  # a fault that equations without noise tell
+    noise = noise or 1.0  # for a fault that noise-free equations determine
     unit = np.where(natural > 0.0, noise / sizes, noise / float(np.max(sizes, initial=1.0)))
     exactly = _TriedGains(model, unit, lag, roughly=False)
     if model.order >= ROUGH_FROM:
@@ -104,15 +105,17 @@ def default_rates(
 
 
 class _TriedGains:
-    """The gains of walks of some powers of ten, each found once; ``roughly``: no better than a search needs, from the
-    share of noise that worked last."""
+    """The gains for random walks of some powers of ten, each computed once.
+
+    With ``roughly`` they are only as accurate as a search needs, starting from the share of noise that worked last.
+    """
 
     def __init__(self, model: FilterModel, unit: FloatArray, lag: int, *, roughly: bool) -> None:
         self.model, self.unit, self.lag, self.roughly = model, unit, lag, roughly
         self.gains: dict[float, KalmanGain | None] = {}
 
     def gain(self, exponent: float) -> KalmanGain | None:
-        """Return the gain, ``None`` where there is none."""
+        """Return the gain, or ``None`` if there is none."""
         if exponent not in self.gains:
             like = None
             if self.roughly:
@@ -125,8 +128,10 @@ class _TriedGains:
         return self.gains[exponent]
 
     def noise(self, exponent: float) -> float:
-        """Return what noise does to the estimates with a gain, in sizes of the faults, at worst; NaN, which decides
-        nothing, where errors hardly decay."""
+        """Return the largest deviation of an estimate by noise, in units of the sizes of the faults.
+
+        The result is NaN, which satisfies no comparison, if errors hardly decay.
+        """
         model, gain = self.model, _required_gain(self.gain(exponent))
         driven = model.N - gain.K @ model.M
         read = model.estimate / np.maximum(model.fault_sizes, SMALLEST)[:, None]
@@ -135,22 +140,22 @@ class _TriedGains:
         return worst if np.isfinite(worst) else np.nan
 
     def missed(self, exponent: float, seconds: float) -> float:
-        """Return what estimates miss of a step after a time, infinite without a gain."""
+        """Return the error of the estimates of a unit step after a time, infinite without a gain."""
         gain = self.gain(exponent)
         return np.inf if gain is None else step_misses(self.model, gain, seconds)
 
 
 class _Walk(NamedTuple):
-    """A power of ten, after how long steps show with it, and what estimates may miss of them then."""
+    """An intensity of a random walk, and the time and the error with which it estimates a unit step."""
 
-    exponent: float
-    seconds: float
-    most: float
-    noisier: bool = False  # whether faster ones show more, with too much noise
+    exponent: float  # of ten
+    seconds: float  # time after which the step is estimated
+    most: float  # largest error of the estimate then
+    noisier: bool = False  # whether larger intensities have smaller errors, but too much noise
 
 
 def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
-    """Return the slowest walk with which steps are seen in time, or in so many times as long."""
+    """Return the smallest intensity with which steps are estimated in time, or in a multiple of that (``longer``)."""
     exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
     for waited in range(longer + 1):
         seconds *= LONGER if waited else 1.0
@@ -166,7 +171,7 @@ def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
         raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
     high = exponents[len(misses) - 1]
     if least > RATE_REACHED:
-        # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
+        # Because of a zero every estimate of a step is slow: take the smallest intensity with about the least error.
         close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
         high = next(e for e, miss in zip(exponents, misses, strict=True) if gains.gain(e) is not None and miss <= close)
         return _Walk(high, seconds, close)
@@ -183,11 +188,11 @@ def _slowest_walk(gains: _TriedGains, seconds: float, longer: int) -> _Walk:
 
 
 def _by_interpolation(gains: _TriedGains, exponent: float, seconds: float) -> float:
-    """Return what halving of the decade below comes to, by fewer gains."""
+    """Return the same intensity as bisection of the decade below would, with fewer gains."""
     steps = 2**RATE_BISECTIONS
 
     def excess(step: int) -> float:
-        """Return the logarithm of what is missed at a step, over what may be."""
+        """Return the logarithm of the error at a step of the grid, relative to the allowed one."""
         return float(np.log(max(gains.missed(step / steps, seconds), SMALLEST) / RATE_REACHED))
 
     high = round(exponent) * steps
@@ -196,7 +201,8 @@ def _by_interpolation(gains: _TriedGains, exponent: float, seconds: float) -> fl
     while high - low > 1:
         middle, room = (low + high) // 2, high - low
         if np.isfinite(above) and room > 2:
-            # A step beyond where the line crosses, on the side that was not looked at last: both ends move.
+            # One grid step beyond the zero of the line, on the side that was not evaluated last, so that both ends
+            # move.
             crossing = low + room * above / (above - below)
             middle = int(np.floor(crossing)) - 1 if last_was_high else int(np.ceil(crossing)) + 1
             middle = min(max(middle, low + 1), high - 1)
@@ -209,14 +215,14 @@ def _by_interpolation(gains: _TriedGains, exponent: float, seconds: float) -> fl
 def _at(
     model: FilterModel, walks: FloatArray, gain: KalmanGain, found: _Walk, lag: int
 ) -> tuple[FloatArray, KalmanGain]:
-    """Return walks, and their gain with when it shows a step."""
+    """Return the intensities, and their gain with the time and the error of its estimate of a step."""
     slow_gain = _forgetting_gain(model, walks, gain, found.seconds, lag)
     shown = (found.seconds, step_misses(model, slow_gain, found.seconds))
     return walks, replace(slow_gain, step_time_and_miss=shown, noisier_if_faster=found.noisier)
 
 
 def _forgetting_gain(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:
-    """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
+    """Return the gain, or if its errors last too long, one for the same intensities with faster errors if it exists."""
     speed = slowest_decay(model.A - gain.K @ model.C, model.dt)
     for times in TOO_SLOW:
         slowest = 1.0 / (times * seconds)
@@ -230,7 +236,7 @@ def _forgetting_gain(model: FilterModel, walks: FloatArray, gain: KalmanGain, se
 
 
 def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
-    """Return how far estimates of a unit step of each fault are from it at and after a time, at worst."""
+    """Return the largest error of the estimates of a unit step of each fault, at and after a time."""
     a = model.A - gain.K @ model.C
     worst = 0.0
     start = model.drive @ np.linalg.pinv(model.estimate[:, model.order :])
@@ -256,9 +262,11 @@ def _required_gain(gain: KalmanGain | None) -> KalmanGain:
 
 @dataclass(frozen=True, eq=False)
 class DelayCurve:
-    """Deviations ``(rates, lags)`` of the delayed error of the estimate of a fault, in its ``unit`` (empty: not known).
+    """Standard deviations ``(rates, lags)`` of delayed estimates of a fault, in its ``unit`` (empty: unknown).
 
-    ``rates``: deviations of the steps of a walk of the fault, in that unit per sample; ``lags``: samples."""
+    ``rates`` are random-walk intensities of the fault, the deviations of its steps in that unit per sample.  ``lags``
+    are delays in samples.
+    """
 
     fault: str
     rates: tuple[float, ...]
@@ -268,13 +276,13 @@ class DelayCurve:
 
     @property
     def title(self) -> str:
-        """What the deviations are of, and their unit: of the Kalman filter of each walk, whatever the design is."""
+        """The quantity with its unit: the deviation of a Kalman filter for each random walk, whatever the design is."""
         unit = f" ({self.unit})" if self.unit else ""
         return f"Least standard deviation of an estimate of {self.fault}{unit} that walks, by its delay in samples"
 
     @property
     def sentence(self) -> str:
-        """What the first sample of delay is worth at the middle walk, and five of them."""
+        """The effect of one sample of delay, and of five samples, for the middle intensity."""
         row = self.deviations[len(self.rates) // 2]
         rate = self.rates[len(self.rates) // 2]
         at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
@@ -289,7 +297,7 @@ class DelayCurve:
 
 
 def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) -> DelayCurve | None:
-    """Return the curve of a fault of a sampled plant, free of all others; ``None`` where it cannot be estimated."""
+    """Return the curve for a fault of a sampled plant with all others decoupled; ``None`` if it is not estimable."""
     if not plant.dt > 0.0 or not plant.nw:
         return None
     removed = [j for j in range(plant.nf) if j != fault]

@@ -27,47 +27,49 @@ from obsynth.verification.invisible_at_infinity import proved_at_infinity
 from obsynth.verification.invisible_faults import invisible_pencil, proved_least, proved_limit
 from obsynth.verification.seen_outputs import Setting, nearly_dependent_outputs, with_independent_outputs, with_outputs
 
-#: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
+#: Shares above the recomputed gain that are claimed: the first one that can be proved.
 CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
-#: More of them for a gain that is at most so many times what counts as zero, up to this share of what the noise could
-#: do in a sample, whatever cancels.
+#: For a gain of at most so many times the one that counts as zero, further factors are tried, up to this share of the
+#: largest effect of the noise in a sample without cancellation.
 NEARLY_NOTHING, SMALL_GAIN, SMALL_GAIN_ROOMS = 1e4, 1e-4, np.geomspace(2.0, 1e6, 20)
-#: At so many of them all eigenvalues of the Hamiltonian matrix are enclosed, in some tenths of a second each.
+#: Number of levels at which all eigenvalues of the Hamiltonian matrix are enclosed, in some tenths of a second each.
 MOST_ENCLOSURES = 5
-#: Levels that are claimed of a gain that is zero but for rounding, in units of what counts as zero.
+#: Levels that are claimed for a gain that is zero up to rounding, in units of the gain that counts as zero.
 ZERO_LEVELS = (1.0, 1e1, 1e2, 1e3, 1e4)
-#: Slacks of the inequality that the certificate solves, of the square of the output matrix.
+#: Slacks of the inequality that the certificate solves, relative to the square of the output matrix.
 SLACKS = (1e-3, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
-#: A deviation that comes out otherwise than in the search, by this share, is that of rounding where it is small.
+#: A small deviation that differs from that of the search by more than this share is due to rounding.
 ROUNDING_OF_DEVIATIONS = 3e-7
-#: A bound this near the gain, as a share of it, is not improved further: the search of the gain ends at 1e-8.
+#: A lower bound within this share of the gain is not improved further, since the search for the gain ends at 1e-8.
 CLOSE_ENOUGH = 3e-8
-#: What is claimed of a proved bound: machines differ in the last digits of the combination that they find.
+#: Share of a proved bound that is claimed, since machines differ in the last digits of the combinations that they find.
 CLAIMED_SHARE = 1.0 - 1e-10
-#: Levels from which a bound is looked for, until one is proved from itself.
+#: Number of levels near which a bound is searched, until the bound can be proved again from itself.
 REPETITIONS = 4
-#: Decays below this per sample are left to the last samples, which are free.
+#: Decays per sample below this are left out: the last samples, which are free, contain such signals.
 FASTEST_DECAY = 1e-2
-#: Slower ones last too long for the sums of their energies.
+#: Slower decays are left out, since their signals last too long for the sums of their energies.
 SLOWEST_DECAY = 1.0 - 1e-12
-#: Imaginary parts below this share are rounding; angles nearer to those of real points than this are theirs.
+#: Imaginary parts below this share are rounding, and angles within this distance of 0 and pi are those of real points.
 REAL_SHARE, EDGE_ANGLE = 1e-9, 1e-9
-#: How far, as a share, a frequency is moved off the circle, or the axis, so that its signals decay.
+#: Share by which a frequency is moved off the circle or the axis, so that its signals decay.
 OFF_THE_EDGE = 1e-9
-#: Infinite frequency is so many times the Cayley point: what is not yet the limit there falls with its square, and
-#: double precision, in which directions are looked for, loses digits with it (1e9 left .14 of a gain of 1.03).
+#: In place of infinite frequency, so many times the Cayley point.  The distance from the limit there falls with the
+#: square of this number, but double precision, in which directions are searched, loses digits with it (1e9 left .14 of
+#: a gain of 1.03).
 INFINITE_FREQUENCY = 1e6
-#: Gains of filters from outputs that depend on others but for rounding, in units in which the plant is near one, and
-#: the share of a bound that they may cost: one of 1e4 is far beyond what noise allows, and 1e12 is rounding itself.
+#: Limits on the gains of filters from outputs that depend on others up to rounding, in units in which the plant is near
+#: one, and the largest share of a bound that such a limit may cost.  A gain of 1e4 is far beyond what noise allows, and
+#: 1e12 is rounding itself.
 ANSWER_LIMITS, ANSWERED_SHARE = (1e10, 1e8, 1e6, 1e4), 1e-8
-#: Last samples that are free beyond the delay, and unknowns of all of them that are solved for.
+#: Number of last samples beyond the delay whose signals are free, and largest number of unknowns of all free samples.
 MORE_SAMPLES, MOST_UNKNOWNS = 3, 150
 
 
 def certified(
     plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: RealisedFilter, norm: str
 ) -> tuple[dict[str, FloatArray], dict[str, float]]:
-    """Return the claims of a filter and their witnesses; raise `SolverError` where no gain near its own is proved."""
+    """Return the witnesses and the claims of a filter; raise `SolverError` if no gain near its own can be proved."""
     fault_map = chosen.fault_map
     claims = {"order": float(observer.order)}
     if fault_map.delay is not None:
@@ -80,7 +82,7 @@ def certified(
     else:
         levels = [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
     if chosen.gain <= NEARLY_NOTHING * chosen.nothing:
-        # The gain may be lost in the stored numbers, which have a larger one then.
+        # The stored numbers may have a larger gain, by rounding.
         levels += [float(level) for level in levels[-1] * SMALL_GAIN_ROOMS if level <= SMALL_GAIN * channel.size]
     matrices: dict[str, FloatArray] = {}
     for number, level in enumerate(levels):
@@ -106,12 +108,13 @@ def certified(
 
 
 def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str, float]:
-    """Return the claims of a filter of least mean square: of rounding, a bound on that of the stored numbers."""
+    """Return the claims of a filter of least mean square, or if that is rounding, a bound for the stored numbers."""
     own, gain = channel.deviation(dt), 0.0 if chosen.is_nothing else chosen.gain
     if ZERO_GAIN * channel.size < own <= channel.rounding and abs(own - gain) > ROUNDING_OF_DEVIATIONS * gain:
         return {"deviation": float(10.0 ** np.ceil(np.log10(2.0 * own))), "least_deviation": 0.0}
     if chosen.is_nothing and ZERO_GAIN * channel.size < own <= chosen.nothing:
-        # Noise that the filter reads by rounding only: small beside what it estimates, not beside what it reads.
+        # Noise that affects the estimates only by rounding, which is small relative to the estimated signals, but not
+        # relative to the outputs.
         return {"deviation": own, "least_deviation": 0.0}
     if gain and own > channel.rounding and not abs(own - gain) <= DEVIATION_SHARE * gain:
         raise SolverError(
@@ -123,7 +126,7 @@ def _deviations(chosen: Designed, channel: ErrorChannel, dt: float) -> dict[str,
 
 
 def gain_matrix(channel: ErrorChannel, level: float, dt: float, alpha: float) -> FloatArray | None:
-    """Return a matrix P that proves the bounded real inequality of an error system at a level; ``None`` for none."""
+    """Return a matrix P that proves the bounded real inequality of an error system for a level, or ``None``."""
     channel = channel.in_units_of(level)
     (a, b, c, d), own = channel.middle, level / channel.unit
     if dt == 0.0:
@@ -148,12 +151,12 @@ def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
 def _lower_bounds(
     plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, claims: dict[str, float]
 ) -> dict[str, FloatArray]:
-    """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
+    """Add the proved lower bounds for all causal filters, and for all delays, to the claims; return the witnesses."""
     read = with_independent_outputs(plant)
     nearly = nearly_dependent_outputs(read)
     read = with_outputs(read, [i for i in range(read.ny) if i not in nearly])
     if read.ny < plant.ny:
-        # The filter is one for added noise, and so is the worst noise: without the others it needs none.
+        # The worst noise was computed for added noise, which is not needed without the dependent outputs.
         worst = designed(read, chosen.fault_map, "hinf")
         chosen = chosen._replace(
             problem=worst.problem, limit=worst.limit, limit_angle=worst.limit_angle, decays=worst.decays
@@ -172,10 +175,10 @@ def _bounds_beside(
     observer: LinearObserver,
     of_others: tuple[dict[str, FloatArray], dict[str, float]],
 ) -> dict[str, FloatArray]:
-    """Claim what is proved of filters with any gain from the other outputs, and a limited one from the dependent ones.
+    """Add proved lower bounds for filters with any gain from the other outputs, and a limited one from dependent ones.
 
-    The limit is the largest of those that are tried that costs nothing; ``of_others``: witnesses and claims for the
-    others alone, of which only what is proved of all outputs is left.
+    The limit is the largest tried one that hardly changes the bounds.  ``of_others`` are witnesses and claims for the
+    other outputs alone, from which bounds that are not proved for all outputs are removed.
     """
     (matrices, claims), units = of_others, PlantUnits.of(plant).rounded()
     least, limit = claims.pop("least", None), claims.pop("non_causal_limit", None)
@@ -208,14 +211,14 @@ def _bounds_beside(
 
 
 def _bounds_of_outputs(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
-    """Claim what is proved of every causal filter of a plant whose outputs are independent; return the witnesses."""
+    """Add proved lower bounds for all causal filters of a plant with independent outputs; return the witnesses."""
     fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
     setting, plant = fault_map.setting, fault_map.driven(plant)
     block = plant.nx + plant.nf + plant.nd + plant.nw
     samples = min(setting.longest + MORE_SAMPLES, max(setting.longest, 1) + MOST_UNKNOWNS // block)
     best_points: list[complex] = []
     for points in _candidates(plant, chosen):
-        # In double precision first, which is enough for most.
+        # First in double precision, which suffices for most plants.
         bound = proved_least(plant, points, samples, setting, level=chosen.gain, enough=0.0)
         if bound is not None and best < bound * CLAIMED_SHARE <= claims["gain"]:
             best, best_points = bound * CLAIMED_SHARE, points
@@ -246,7 +249,7 @@ def _bounds_of_outputs(plant: DescriptorSystem, chosen: Designed, claims: dict[s
 def _repeatable(
     plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, level: float
 ) -> float | None:
-    """Return a bound that a verification proves again, which looks near the bound itself and not near the gain."""
+    """Return a bound that verification can prove again: it searches near the bound itself, and not near the gain."""
     for _ in range(REPETITIONS):
         bound = proved_least(plant, points, samples, setting, level=level)
         if bound is None:
@@ -273,7 +276,7 @@ def _edge_point(plant: DescriptorSystem, chosen: Designed) -> complex:
 
 
 def _candidates(plant: DescriptorSystem, chosen: Designed) -> list[list[complex]]:
-    """Return sets of points to be tried: zeros where only these are invisible, else the worst noise, level by level."""
+    """Return the sets of points to try: zeros if only these are invisible, else those of the worst noise by level."""
     free = plant.nf + plant.nd + plant.nw - plant.ny
     if free <= 0:
         return [_zeros_outside(plant), []] if plant.is_discrete else [_zeros_outside(plant)]
@@ -286,7 +289,7 @@ def _candidates(plant: DescriptorSystem, chosen: Designed) -> list[list[complex]
 
 
 def _point_of(plant: DescriptorSystem, chosen: Designed, decay: complex) -> complex | None:
-    """Return where a decay per sample (of the Cayley transform, in continuous time) is; ``None`` for conjugates."""
+    """Return the point of a decay per sample (in continuous time of the Cayley transform); ``None`` for conjugates."""
     real = abs(decay.imag) <= REAL_SHARE * abs(decay)
     if (decay.imag < 0.0 and not real) or abs(decay) >= SLOWEST_DECAY:
         return None
@@ -297,7 +300,8 @@ def _point_of(plant: DescriptorSystem, chosen: Designed, decay: complex) -> comp
 
 
 def _zeros_outside(plant: DescriptorSystem) -> list[complex]:
-    """Return the finite zeros, from all that is invisible to the outputs, that are not stable; none of wide plants."""
+    """Return the unstable finite zeros from faults, disturbances and noise to the outputs, for as many outputs as
+    inputs; none otherwise."""
     inputs, through = np.hstack([plant.Bf, plant.Bd, plant.Bw]), np.hstack([plant.Df, plant.Dd, plant.Dw])
     if inputs.shape[1] != plant.ny:
         return []

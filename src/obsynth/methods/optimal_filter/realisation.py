@@ -1,7 +1,8 @@
 """The realisation of an optimal filter from u and y, with T and T0, which relate its state to the plant's.
 
-The filter of least gain reads y alone.  Its state follows ``T E x`` where nothing but u acts, which gives what u adds;
-modes of the plant that die out by themselves and that it reads are followed by a copy that only u drives.
+The filter of least gain has the input y alone.  Without faults, disturbances and noise its state follows ``T E x``,
+which determines the effect of u.  Decaying modes of the plant that affect the filter are modelled by a copy that only u
+drives.
 """
 
 from __future__ import annotations
@@ -39,48 +40,51 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel, with_past
 
-#: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
+#: Entries of the filter below this share of the largest one of their matrix are rounding.
 ROUNDING_SHARE = 1e-14
-#: What passes at once and is smaller, of what passes by way of the states, is rounding: it is a difference of products.
+#: Entries of the feedthrough below this share of the response by the states are rounding of a difference of products.
 PASSED_ROUNDING = 1e-12
-#: Of a filter that otherwise follows nothing, entries below this share of the largest are rounding, of many products.
+#: If a filter has no error system otherwise, entries below this share of the largest count as rounding of many
+#: products.
 COARSE_ROUNDING = 1e-12
-#: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
+#: Entries of A of a sampled filter below this are rounding, since its states have the size of the outputs.
 ROUNDED_MODE = 1e-12
-#: Sweeps over all states until their units are balanced, but for a factor.
+#: Number of sweeps over all states in which their units are balanced.
 BALANCING_SWEEPS = 5
-#: Equations are solved so many times, each time for what is left: small rows of a filter keep their digits.
+#: Number of times that equations are solved, each time for the remaining residual, so that small rows of a filter keep
+#: their digits.
 SOLUTIONS = 3
 
 
 def minimal(filter_: Model, *, discrete: bool | None = None) -> Model:
-    """Return a filter without states that are not reached or not read; ``discrete`` of a stable one, where known."""
+    """Return a filter without unreachable and unobservable states; ``discrete``: the time of a stable one, if known."""
     a, b, c, d = filter_
-    # Of a filter of finite response nothing but rounding may be left of the modes.
+    # In a filter of finite impulse response the entries of A may be nothing but rounding.
     a = np.where(np.abs(a) > ROUNDED_MODE, a, 0.0) if discrete else a
     basis = reachable_basis(a, b)
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
     basis = reachable_basis(a.T, c.T)
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
-    # Of what passes by way of the states in the end: in continuous time the sizes of b are those of rates.
+    # Relative to the static response by the states: in continuous time the entries of b are rates.
     driven = np.linalg.lstsq(a, b, rcond=None)[0] if discrete is False and len(a) else b
     passed = float(np.linalg.norm(d) + np.linalg.norm(c) * np.linalg.norm(driven))
     return _cleaned(a), _cleaned(b), _cleaned(c), np.where(np.abs(d) > PASSED_ROUNDING * passed, d, 0.0)
 
 
 def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list[Model]:
-    """Return the minimal realisation, and others that keep digits which it loses.
+    """Return the minimal realisation, and others that are more accurate.
 
-    Of a long window it keeps no digits of coefficients that are as small as rounding.  In sampled time a balanced one
-    does, and one without the states that by their zeros are not reached or not read; the first has fewer states.
-    ``outputs (ny,)``: units, powers of two, in which the outputs are near one: what is rounding is judged in them.
+    For a long window the minimal realisation has no correct digits of coefficients of the size of rounding.  In sampled
+    time a balanced realisation has these digits, and so has one in which only states are removed that zero entries
+    disconnect from inputs or outputs; the first has fewer states.  ``outputs (ny,)`` are units, powers of two, in which
+    the outputs are near one and rounding is judged.
     """
     a, b, c, d = filter_
     filter_ = _without_rounding((a, b / outputs, c, d / outputs))
     minimal_ones = [minimal(filter_, discrete=discrete)]
     if discrete:
         minimal_ones.append(_without_small_responses(filter_))
-        # Chains of delays that hardly respond may keep many states that are reached by rounding only.
+        # Chains of delays with small responses may contain many states that are only reachable by rounding.
         minimal_ones.sort(key=lambda one: len(one[0]))
         a, b, c, d = filter_
         linked = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
@@ -92,7 +96,7 @@ def realisations(filter_: Model, outputs: FloatArray, *, discrete: bool) -> list
 
 
 def _without_rounding(filter_: Model) -> Model:
-    """Return a filter without entries of B and C that are nothing beside what passes at once."""
+    """Return a filter without entries of B and C whose responses are rounding relative to the feedthrough."""
     a, b, c, d = filter_
     size = ROUNDING_SHARE * float(np.linalg.norm(d))
     input_size, output_size = float(np.linalg.norm(b)), float(np.linalg.norm(c))
@@ -100,13 +104,14 @@ def _without_rounding(filter_: Model) -> Model:
 
 
 def _without_small_responses(filter_: Model) -> Model:
-    """Return a sampled filter in balanced states, without those whose Hankel singular value is rounding."""
+    """Return a sampled filter in balanced coordinates, without states whose Hankel singular value is rounding."""
     a, b, c, d = plainly_truncated(filter_, len(filter_[0]), discrete=True)
     return _cleaned(a), _cleaned(b), _cleaned(c), d
 
 
 def _balanced(filter_: Model) -> Model:
-    """Return a filter with states in units, powers of two, in which each is driven as much as it drives."""
+    """Return a filter with balanced units of the states, powers of two: for each state, the norms of its row and of its
+    column are about equal."""
     a, b, c, d = filter_
     units = np.ones(len(a))
     for _ in range(BALANCING_SWEEPS):
@@ -120,7 +125,7 @@ def _balanced(filter_: Model) -> Model:
 
 
 def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which states are linked to the first ones, ``link[i, j]``: from j to i."""
+    """Return which states are reachable from the ``first`` ones, with ``link[i, j]`` from j to i."""
     linked = first
     for _ in range(len(link)):
         more = linked | (link @ linked)
@@ -131,7 +136,7 @@ def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.boo
 
 
 def _cleaned(matrix: FloatArray, share: float = ROUNDING_SHARE) -> FloatArray:
-    """Return a matrix without entries that are rounding of its largest."""
+    """Return a matrix without entries below a share of its largest one."""
     return np.where(np.abs(matrix) > share * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
 
 
@@ -156,9 +161,9 @@ def filter_with_error_system(
 def realised_behind_delay(
     plant: DescriptorSystem, filters: Sequence[Model], longest: int, later: int
 ) -> RealisedFilter:
-    """Return a realisation, behind ``later`` samples of delay, of a filter that shows inputs so many samples later.
+    """Return a realisation, behind ``later`` samples of delay, of a filter that looks so many samples ahead in inputs.
 
-    Its errors are a state only there; known inputs must not be among those that it needs before they have acted.
+    Only behind that delay do its errors have a state equation.  Known inputs must not be needed before they have acted.
     """
     delayed = []
     for a, b, c, d in filters:
@@ -168,7 +173,7 @@ def realised_behind_delay(
             b, c, d = np.vstack([b, d]), np.hstack([np.zeros((rows, order)), np.eye(rows)]), np.zeros_like(d)
         delayed.append((a, b, c, d))
     found = filter_with_error_system(plant, delayed, longest, finished=lambda follower: follower)
-    # The copies of modes come last: the delay does behind them.
+    # Reorder the states: the delay comes after the copies of modes.
     whole = next(len(a) for a, *_ in delayed if np.array_equal(a, found.A[: len(a), : len(a)]))
     own = whole - later * len(found.C)
     order = np.r_[:own, whole : len(found.A), own:whole]
@@ -198,7 +203,7 @@ def _first_with_error_system(
         for filter_ in filters:
             follower, share = _realised_with_lag(plant, filter_, rows, moved, lag)
             if follower is not None and len(rows) and not _keeps_identities(plant, follower):
-                # Copies that are hardly read were left out, of which a filter that follows little else has much.
+                # Copies with small effects were left out; in this filter, which contains little else, they matter.
                 continue
             if follower is not None and share == IDENTITIES_LEFT[0]:
                 return finished(follower)
@@ -218,7 +223,7 @@ def _first_with_error_system(
 
 
 def _keeps_identities(plant: DescriptorSystem, follower: RealisedFilter) -> bool:
-    """Whether a filter with its copies keeps the identities, of the numbers that are stored, as they are verified."""
+    """Whether the stored numbers of a filter with its copies satisfy the identities, as in verification."""
     names = tuple(f"estimate {i + 1}" for i in range(len(follower.C)))
     observer = observer_of(plant, follower, names, (0,) * len(names))
     model = ErrorModel(plant, observer, follower.T, -follower.T0, lag=follower.lag, decoupled=True)
@@ -228,7 +233,7 @@ def _keeps_identities(plant: DescriptorSystem, follower: RealisedFilter) -> bool
 def observer_of(
     plant: DescriptorSystem, error_system: RealisedFilter, names: tuple[str, ...], delays: tuple[int, ...]
 ) -> LinearObserver:
-    """Return the observer; known inputs enter it as they do the plant."""
+    """Return the observer, with the known inputs as in the plant."""
     t, t0 = error_system.T[:, : plant.nx], error_system.T0[:, : plant.nx]
     named = names == plant.fault_names
     return LinearObserver(
@@ -252,7 +257,7 @@ def observer_of(
 def without_undriven(
     observer: LinearObserver, follower: RealisedFilter
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
-    """Return an observer without copies that nothing drives, which stay at zero, and what its errors hold of them."""
+    """Return an observer without the copies of modes that no input drives, and the matrices of these in its errors."""
     own = observer.order - follower.undriven
     if own == observer.order:
         return observer, {}
