@@ -86,16 +86,16 @@ def test_the_share_of_time_in_alarm_is_told_beside_the_events():
 
 
 class Ranked(Rule):
-    """A rule that alarms and does not tell the faults apart, with a ranking beside it."""
+    """A rule that alarms and does not tell the faults apart, or names one, with a ranking beside it."""
 
-    def __init__(self, ranking: Ranking | None) -> None:
-        self.ranking = ranking
+    def __init__(self, ranking: Ranking | None, fault: int = NOT_DISTINGUISHED) -> None:
+        self.ranking, self.fault = ranking, fault
 
     def init(self) -> None:
         return None
 
     def step(self, state: None, sample: Sample) -> tuple[None, RuleOutput]:
-        return None, RuleOutput(2.0, 1.0, NOT_DISTINGUISHED, (), self.ranking)
+        return None, RuleOutput(2.0, 1.0, self.fault, (), self.ranking)
 
     def restart(self, state: None, skipped: int = 0) -> None:
         return None
@@ -120,6 +120,20 @@ def test_shares_name_a_fault_where_they_suffice_and_else_all_that_are_as_likely(
              ranking=output.ranking)  # fmt: skip
     heading, row = alarm_rows(log.events(), str)[0]
     assert dict(zip(heading, row, strict=True))["fault"] == shown
+
+
+def test_a_fault_that_the_rule_names_is_as_likely_as_others_and_not_as_itself() -> None:
+    """The alarm of a clog said "as likely as: clog", and the leak was not shown."""
+    shares = (("leak", 0.5), ("clog", 0.5), ("none of these faults", 0.0))
+    rule = Ranked(Ranking(shares, "leak", ("clog",)), 1)
+    monitor = Monitor("learned", "", rule, 1, ("leak", "clog"), np.ones(2))
+    _, output = monitor.step(monitor.init(), Sample(0.0, np.ones(1), np.ones(2), None))
+    log = AlarmLog(COLUMNS)
+    log.take("learned", output.fault, 2.0, 0.0, 1, (0.5, 0.0, 0.1, 0.1), ranking=output.ranking)
+    (event,) = log.events()
+    assert (event.fault, event.ties) == ("clog", ("leak",))
+    heading, row = alarm_rows(log.events(), str)[0]
+    assert dict(zip(heading, row, strict=True))["fault"] == "clog or leak"
 
 
 def test_a_long_alarm_says_that_later_faults_may_have_no_name() -> None:

@@ -98,6 +98,17 @@ def test_what_errors_of_the_model_leave_is_no_change() -> None:
     assert strong.distinguishes(later, 0.025 * strong.ratio, {"worn"})
 
 
+def test_a_fault_that_comes_again_after_its_alarm_ended_is_a_later_change() -> None:
+    """Else another cause that the first row alone made likelier kept the name, whatever the rows after it said."""
+    changes, *_ = followed(6, named=True)
+    again = Ranking((("sensor T", 1.0),), "sensor T")
+    assert not changes.distinguishes(again, 4000.0, {"sensor T"})
+    ended = changes._replace(is_over=1)
+    assert ended.distinguishes(again, 4000.0, {"sensor T"})
+    assert not ended.distinguishes(again, 17.0, {"sensor T"})
+    assert not ended.distinguishes(again._replace(named=NONE_OF_THESE), 4000.0, {"sensor T"})
+
+
 def test_a_change_that_came_later_has_an_alarm_of_its_own_and_is_named_where_it_is_largest() -> None:
     log = AlarmLog(["time"])
 

@@ -35,3 +35,7 @@ class Ranking(NamedTuple):
     def called(self, faults: Sequence[str]) -> str:
         """Return the name of an alarm: empty if several ``faults`` of the plant are equally likely."""
         return "" if self.named in faults and any(name in faults for name in self.ties) else self.named
+
+    def named_by(self, cause: str) -> Ranking:
+        """Return the ranking named by another one of the equally likely causes."""
+        return self._replace(named=cause, ties=tuple(name for name in (self.named, *self.ties) if name != cause))

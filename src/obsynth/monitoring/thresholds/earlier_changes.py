@@ -151,8 +151,9 @@ class EarlierChanges(NamedTuple):
     def distinguishes(self, later: Ranking, ratio: float, names: set[str]) -> bool:
         """Whether a ``later`` change is significant, and another one than the earlier ones with these ``names``.
 
-        Its ``ratio`` after subtraction must exceed what errors of the model leave of the earlier effects.
+        Its ``ratio`` after subtraction must exceed what errors of the model leave of the earlier effects.  During the
+        alarm of these, a change of the same name is such an error; afterwards the same fault may come again.
         """
-        if names & {later.named, *later.ties} or later.named == NONE_OF_THESE:
+        if later.named == NONE_OF_THESE or (not self.is_over and names & {later.named, *later.ties}):
             return False
         return ratio >= LEAST_RATIO * ratio_scale(self.ratio)

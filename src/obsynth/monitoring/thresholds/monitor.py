@@ -346,6 +346,8 @@ class Monitor:
         decided = number is not None and number != NOT_DISTINGUISHED
         of_plant = ranking is None or (decided and math.isnan(ranking.ratio) and ranking.named in self.fault_names)
         fault = self._named(number) if of_plant or ranking is None else ranking.called(self.fault_names)
+        if ranking is not None and fault in ranking.ties:
+            ranking = ranking.named_by(fault)
         return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
     def _named(self, number: int | None) -> str:
