@@ -194,3 +194,10 @@ def test_two_faults_that_cancel_are_called_a_combination():
     )
     report = check(discretise(tanks, 5.0).plant)["fault-estimation-filter"]
     assert "a combination of the faults 'leak', 'pump wear' is output-nulling" in report["exists: fault zeros"].detail
+
+
+def test_a_real_mode_is_written_as_one():
+    """The detection filter named 'the mode s = 0+0j'."""
+    plant = DescriptorSystem(A=[[0, 0], [0, -1]], C=[[0, 1]], Bf=[[0], [1]], Bd=[[0], [1]], Dd=[[1]])
+    report = check(plant)["detection-filter"]
+    assert any("the mode s = 0 is undetectable" in row.detail for row in report.checks)

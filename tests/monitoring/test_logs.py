@@ -190,19 +190,20 @@ def test_a_picture_of_one_s_own_data(design, frame):
     monitor = obsynth.online_monitor(design, "chi-square")
     run = obsynth.run_on_data(design, frame, monitor=monitor, thresholds=THRESHOLDS)
     figure = Figure()
-    axes = list(figure.subplots(6, 1))
+    # The valve stands still, so that it has no panel.
+    axes = list(figure.subplots(5, 1))
     panels = plot_data(run, design=design, axes=axes)
     labels = [panel.get_ylabel() for panel in panels]
     assert [label.replace("\n", " ") for label in labels] == [
-        "level (m)", "flow", "valve", "leak (kg/s)", "residuals (kg/s)", "statistic",
+        "level (m)", "flow", "leak (kg/s)", "residuals (kg/s)", "statistic",
     ]  # fmt: skip
     assert design.plant.input_names == ("valve",)
-    drawn = [panel.get_lines()[0].get_label() for panel in panels[:3]]
-    assert drawn == ["measured", "measured", "input"]
-    (estimate,) = [line for line in panels[3].get_lines() if line.get_label() == "estimate"]
+    drawn = [panel.get_lines()[0].get_label() for panel in panels[:2]]
+    assert drawn == ["measured", "measured"]
+    (estimate,) = [line for line in panels[2].get_lines() if line.get_label() == "estimate"]
     assert np.array_equal(estimate.get_ydata(), run.table["fhat[leak]"])
     assert np.array_equal(estimate.get_xdata(), run.table["time of fhat[leak]"])
-    texts = [text.get_text() for text in panels[3].get_legend().get_texts()]
+    texts = [text.get_text() for text in panels[2].get_legend().get_texts()]
     assert "95 % interval of the stated noise" in texts
     assert "threshold" in texts
     assert "alarm at 10.5 s" in texts

@@ -96,7 +96,7 @@ def test_run_and_picture_say_the_same(design: obsynth.ObserverDesign) -> None:
     assert run.statement == watched.statement
     axes = obsynth.plotting.plot_data(run, design=design)
     drawn = " ".join(axes[-1].texts[-1].get_text().split())
-    assert drawn == f"The threshold: {watched.statement}."
+    assert drawn == f"Constant inputs: u1 0. The threshold: {watched.statement}."
     assert obsynth.run_on_data(design, data).statement == ""
 
 

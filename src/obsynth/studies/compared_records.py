@@ -64,7 +64,7 @@ def drawn_runs(
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
     faults = drive.at_begin[:, nu : nu + nf]
     records: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
-    off = tolerance > 0.0 or source.uncertainty is not None
+    off = tolerance > 0.0 or (source.uncertainty is not None and bool(source.uncertainty.box.names))
     for run in range(runs):
         plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
         signals = drive.at_begin + random[:, run]

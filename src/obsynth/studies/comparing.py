@@ -76,7 +76,8 @@ class ComparisonSettings:
         """Return the setting of a comparison as a sentence; ``horizon``, ``limit`` of the settling in seconds."""
         runs = f"{self.runs} runs of {duration(horizon)}, sampled every {dt:g} s"
         parts = [f"{runs}, disturbances and noise of the scenario"]
-        parts += ["constants within their tolerances"] if plant.uncertainty is not None else []
+        uncertain = plant.uncertainty is not None and plant.uncertainty.box.names
+        parts += ["constants within their tolerances"] if uncertain else []
         parts += [f"parameters off by up to {self.tolerance:.0%}"] if self.tolerance else []
         parts += ["a state feedback stabilises the plant"] if stabilised else []
         return f"{', '.join(parts)}; 90 % of a step to be reached within {duration(limit)}"

@@ -13,6 +13,7 @@ from obsynth.analysis.existence.statements import Evaluator
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.proofs.exact_doubles import holds_computed
@@ -110,7 +111,7 @@ def reading_outputs(plant: DescriptorSystem) -> NDArray[np.intp]:
 def _detectable(plant: DescriptorSystem) -> Condition:
     lost = Evaluator(plant.dense()).hidden_modes().outside
     detail = (
-        f"the mode s = {complex(lost[0]):.4g} is undetectable: measure more."
+        f"the mode s = {pole_text(complex(lost[0]), 4)} is undetectable: measure more."
         if lost
         else ("every mode is observable, or decays")
     )

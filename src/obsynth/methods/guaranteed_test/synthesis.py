@@ -386,7 +386,11 @@ def _notes(
             "be needed, and more where the constants change the effect of the fault. For the nominal plant a fault of "
             f"{upper_text(2.0 * threshold)} is certain to pass its threshold."
         )
-    elif isinstance(problem.plant, DescriptorSystem) and problem.plant.uncertainty is not None:
+    elif (
+        isinstance(problem.plant, DescriptorSystem)
+        and problem.plant.uncertainty is not None
+        and problem.plant.uncertainty.box.names
+    ):
         words.append(
             "The threshold is that of the nominal plant: tolerances of its constants are not in it (give a scenario)."
         )

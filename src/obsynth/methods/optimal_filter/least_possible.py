@@ -27,6 +27,7 @@ from obsynth.numerics.standard_form import cayley
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.results.number_texts import number
 from obsynth.verification.error_system import ErrorModel
 
 #: A gain below this share of what the disturbances do to the faults' estimates in one step is zero but for rounding.
@@ -75,7 +76,7 @@ class LeastPossible(NamedTuple):
         alike = "with its response to the faults" if self.delay is None else _with_delay(self.delay)
         if self.gain or self.least_gain:
             least, later = (_in_words(gain, self.gain) for gain in (self.least_gain, self.later_gain))
-            said.append(f"gain {self.gain:.5g}; least of any causal filter {alike}: {least}")
+            said.append(f"gain {number(self.gain, digits=5)}; least of any causal filter {alike}: {least}")
             said += [] if np.isnan(self.later_gain) else [f"with one sample more: {later}"]
         if np.isfinite(self.deviation_share):
             assumed = "" if self.is_noise_stated else ", if it is equal on every output (none is stated)"
@@ -96,7 +97,7 @@ def _in_words(least: float, beside: float) -> str:
         return "not known"
     if 0.0 < least < TINY_SHARE * beside:
         return f"below 1e{int(np.ceil(np.log10(least)))}"
-    return f"{least:.5g}"
+    return number(least, digits=5)
 
 
 def least_possible(design: ObserverDesign, *, later: bool = False) -> LeastPossible | None:

@@ -91,9 +91,9 @@ def plot_data(
     Returns
     -------
     list of Axes
-        One for each of the first six outputs and faults, one for the residuals of each unit, one for the statistic,
-        one for the shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red; in
-        the panel of a fault those that name it.
+        One for each of the first six outputs and inputs that change, and of the faults, one for the residuals of each
+        unit, one for the statistic, one for the shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey,
+        rows with an alarm in red; in the panel of a fault those that name it.
 
     Raises
     ------
@@ -147,10 +147,13 @@ def plot_data(
             fontsize=8,
             color="tab:red",
         )
-    if panels and run.statement:
-        # What an alarm means stands below the picture, as in the run's summary.
+    still = _constant_inputs(run.measured, design) if "outputs" in show else {}
+    below = [f"Constant inputs: {', '.join(_with_value(name, still[name], units) for name in still)}."] if still else []
+    # What an alarm means stands below the picture, as in the run's summary.
+    below += [f"The threshold: {run.statement}."] if run.statement else []
+    if panels and below:
         panels[-1].annotate(
-            fill(f"The threshold: {run.statement}.", STATEMENT_LETTERS),
+            "\n".join(fill(text, STATEMENT_LETTERS) for text in below),
             (0.0, 0.0),
             xycoords="axes fraction",
             xytext=(0, -36),
@@ -179,7 +182,8 @@ def _plans(
     # The input of a linearised plant that is one in every row is in no log.
     plant = getattr(design, "plant", None)
     shift = getattr(getattr(plant, "uncertainty", None), "shift", None) or getattr(plant, "shift", None)
-    outputs = [str(name) for name in measured.columns if name not in ("time", shift)]
+    still = _constant_inputs(measured, design)
+    outputs = [str(name) for name in measured.columns if name not in ("time", shift) and name not in still]
     # Known inputs come first and are no outputs; of these the estimated ones say more.
     outputs.sort(key=lambda name: name not in estimated)
     plans = [("outputs", name) for name in outputs[:MOST_DRAWN]]
@@ -191,11 +195,24 @@ def _plans(
     return [plan for plan in plans if plan[0] in show]
 
 
+def _constant_inputs(measured: pd.DataFrame, design: ObserverDesign | None) -> dict[str, float]:
+    """Return the known inputs that have one value in all rows, with it: a panel of such a one says nothing."""
+    names = [] if design is None else [name for name in design.plant.input_names if name in measured]
+    values = {name: measured[name].to_numpy(dtype=float) for name in names}
+    known = {name: numbers[np.isfinite(numbers)] for name, numbers in values.items()}
+    return {name: float(numbers[0]) for name, numbers in known.items() if numbers.size and np.ptp(numbers) == 0.0}
+
+
 def _residual_units(columns: Iterable[Any], design: ObserverDesign | None) -> dict[str, str]:
     """Return the residuals that are drawn, with their units."""
     units: Mapping[str, str] = {} if design is None else design.plant.units
     names = [str(name) for name in columns if str(name).startswith("r[")][:MOST_DRAWN]
     return {name: unit if (unit := units.get(name[2:-1], "")) != "1" else "" for name in names}
+
+
+def _with_value(name: str, value: float, units: Mapping[str, str]) -> str:
+    unit = units.get(name, "1")
+    return f"{name} {number(value)}{'' if unit in ('', '1') else f' {unit}'}"
 
 
 def _residuals_of(table: pd.DataFrame, design: ObserverDesign | None, unit: str) -> list[str]:
@@ -218,7 +235,8 @@ class _Drawing:
         is_input = self.design is not None and name in self.design.plant.input_names
         panel.plot(measured["time"], measured[name], label="input" if is_input else "measured", **MEASURED_STYLE)
         column = f"xhat[{name}]"
-        if column in self.table:
+        # Where a disturbance biases the estimate of an algebraic state, its measurement says more, and would be hidden.
+        if column in self.table and not self.run.recovered.get(name, "").startswith("biased"):
             panel.plot(self._times(column), self.table[column], label="estimate", **ESTIMATE_STYLE)
         panel.set_ylabel(with_unit(name, self.units))
 
