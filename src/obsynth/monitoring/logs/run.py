@@ -49,49 +49,49 @@ STATE_ROWS = 100
 
 @dataclass(frozen=True, eq=False)
 class DataRun:
-    """What a run on measured data was.
+    """The summary of a run on measured data.
 
     Parameters
     ----------
     rows : int
-        Rows of data.
+        Number of rows of data.
     statuses : mapping of str to int
-        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering``, ``repeated stamp`` and
+        Number of rows by status: ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering``, ``repeated stamp`` and
         ``out of order``.
     alarms : mapping of str to float
-        Time in seconds at which each column, or the monitor, first passed its threshold.
+        Time in seconds at which each column, or the monitor, first exceeded its threshold.
     isolated : str
-        The fault that the monitor named first; empty without one, and where the evidence does not distinguish faults.
+        The first fault that the monitor named; empty without a monitor, or if the evidence does not distinguish faults.
     recovered : mapping of str to str
-        States of the plant as written that were recovered from the estimates, and what each of these estimates is:
-        ``exact``, ``needs the fault estimate`` (it is used) or ``biased by the disturbance``.
+        States of the original plant that were recovered from the estimates, with the kind of each: ``exact``, ``needs
+        the fault estimate`` (which is used) or ``biased by the disturbance``.
     outliers : mapping of str to int
-        How many samples of each output were left out, or pulled to their limit; recursive and nonlinear designs.
+        Number of samples of each output that were left out or limited; for recursive and nonlinear designs.
     warnings : tuple of str
-        What a user should know about the data.
+        Warnings on the data and the run.
     digest : str
         sha256 of the gain set.
     table : pandas.DataFrame or None
-        The estimates, when they were not written anywhere.
+        The estimates, if they were not written to a file or stream.
     measured : pandas.DataFrame or None
-        Time and the signals that were read, in their units, beside that table.
+        Time and measured signals in their units, for the rows of that table.
     stamps : Stamps
-        Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
+        Format of the times of the log, in seconds or as dates: ``stamps.shown(time)`` is a time in this format.
     thresholds : mapping of str to float
-        Those that were given.
+        The given thresholds.
     alarm_rows : mapping of str to int
         Numbers of the rows of these alarms, from 1.
     events : tuple of AlarmEvent
-        All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart,
-        those that are missing among them, are one.
+        All alarms with their times, faults and sizes.  Rows above a threshold that are less than 20 rows apart,
+        counting missing ones, are one alarm.
     silent : mapping of str to int
-        How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
+        Number of rows without a decision by status; ``undecided`` where the monitor does not decide.
     statement : str
-        What the threshold of its monitor promises, and what that rests on; empty without one.
+        Guarantee of the monitor's threshold, with its assumptions; empty without a monitor.
     warm_up : float, seconds
-        How long nothing is decided after the start.
+        Time after the start in which nothing is decided.
     stuck : mapping of str to tuple of (int, int)
-        First and last rows, from 1, in which an output repeats one value for longer than it otherwise does.
+        First and last rows, from 1, in which an output repeats one value for improbably long.
 
     Examples
     --------
@@ -188,7 +188,8 @@ def run_on_data(
     data : path, text stream, pandas.DataFrame, or mapping of columns
         With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``, also
         with ``.gz``), ``.xlsx``, Parquet, TDMS, MDF (``.mf4``, ``.mdf``, ``.dat``), ``.npz`` or ``.mat`` by their
-        suffix; a stream is text and is answered row by row.  Frames of polars and tables of pyarrow are taken as well.
+        suffix; a stream is text, and each of its rows gives a row of output at once.  Frames of polars and tables of
+        pyarrow are accepted as well.
         Units in a second row of the header of a frame, or in ``attrs["units"]``, are read as ``name [unit]``.
         Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma where
         commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone (taken
@@ -197,56 +198,56 @@ def run_on_data(
     out : path or text stream, optional
         CSV or Parquet file, written whole or not at all; or a stream for CSV.  By default a data frame is returned.
     columns : mapping, optional
-        Column of a signal (or of ``time``) where their names differ.
+        Column of a signal (or of ``time``) if their names differ.
     time_column : str, optional
         Column of the time, the same as ``columns={"time": ...}``.
     time_zone : str, optional
-        Zone of dates that name none, such as ``Europe/Berlin`` or ``+01:00``, in which they are written back: the hour
-        that comes twice in autumn is told apart by the order of the rows.
+        Zone of dates without a zone, such as ``Europe/Berlin`` or ``+01:00``; they are written back in this zone.  The
+        order of the rows distinguishes the two occurrences of the repeated hour in autumn.
     time_unit : {"s", "ms", "us", "ns", "min", "h", "d"}, optional
-        Unit of stamps that are numbers, where the log does not say it; ``"d"`` (or ``"days"``) for serial days of
-        spreadsheets and of MATLAB.  Times are then in seconds everywhere.
+        Unit of numerical stamps if the log does not state it; ``"d"`` (or ``"days"``) for serial days of spreadsheets
+        and of MATLAB.  All times are then in seconds.
     scales : mapping, optional, signal's unit per column's unit
         Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
-        Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
-        with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are
-        suspended in rows that are not ``ok`` or ``partial``; while the stated deviation of a fault estimate is above
-        that before samples were missing, its level is as many times higher.
+        Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (for faults with
+        an operating point, of the deviation).  The column ``alarm`` names the columns above their level.  Alarms are
+        suspended in rows that are not ``ok`` or ``partial``.  While the standard deviation of a fault estimate is
+        larger than before samples were missing, its level is higher by the same factor.
     monitor : Monitor, optional
-        From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
-        fault that it points to.
+        From `obsynth.online_monitor`: adds the columns ``statistic`` and ``threshold``, and its alarms in ``alarm``,
+        with the named fault.
     gap : float, optional, seconds
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds
-        After the start, and after gaps at most; by default until the slowest mode has shrunk to 2 %, and none for
-        recursive and nonlinear designs, whose deviations hold from the start.
+        Time without decisions after the start, and at most after gaps; by default until the slowest mode has decayed to
+        2 %, and zero for recursive and nonlinear designs, whose deviations are valid from the start.
     outliers : {"gate", "huber", "none"}, optional
-        Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
-        design says, and a gate of six deviations where it says nothing.
+        Recursive and nonlinear designs: treatment of samples that contradict their prediction; by default that of the
+        design, or a gate of six deviations if the design states none.
     smooth : bool, optional
-        Recursive and nonlinear designs: estimates from the whole log, as `obsynth.smooth` makes them, instead of those
-        of the filter.  Residuals, outliers, monitors and statuses stay those of the filter.  All rows are written at
+        Recursive and nonlinear designs: return estimates from the whole log, as `obsynth.smooth` does, instead of those
+        of the filter.  Residuals, outliers, monitors and statuses remain those of the filter.  All rows are written at
         the end, and the log is held in memory.
     lag : int, optional
-        The same with the ``lag`` samples after each row; each row is written, with its own time, when they are there.
+        The same with the ``lag`` samples after each row; each row is written with its own time once these are there.
     recovered : {"all", "none"} or list of str, optional
-        Which states of the plant as written, before its algebraic states were eliminated, stand beside the estimates;
-        by default all of up to 300, and none of more.
+        States of the original plant, before its algebraic states were eliminated, that are returned as well; by default
+        all if there are at most 300, and otherwise none.
     state : path, optional
-        A saved state to go on from, if the file exists; the state at the end is written to it.
+        A saved state to continue from, if the file exists; the state at the end is written to it.
     state_every : int, optional
-        Rows of a stream after which the state is written anew, whole or not at all: so many are lost at most when the
-        process is killed.
+        Number of rows of a stream after which the state is written again, atomically: at most so many rows are lost if
+        the process is killed.
     chunk_rows : int, optional
-        Rows that are read and written at a time; the results do not depend on it.
+        Number of rows that are read and written at a time; the results do not depend on it.
     progress : callable, optional
-        Called with the number of rows done, after each chunk.
+        Called with the number of processed rows after each chunk.
     units_as_is : bool, optional
-        Whether to go on where one signal is not what the design expects from its first row on (20 rows are looked at),
-        but would be after a usual change of unit: kelvin for degrees Celsius, Pa for bar, g for kg, percent, minutes,
-        hours, or the other sign.  By default such a log is refused, with the likely factor: for recursive and nonlinear
-        designs by their innovations, for linear ones by operating points that are not zero.
+        Whether to accept a signal that contradicts the design in the first 20 rows, but would agree after a usual
+        change of unit: kelvin for degrees Celsius, Pa for bar, g for kg, percent, minutes, hours, or the other sign.
+        By default such a log is refused, with the likely factor.  Recursive and nonlinear designs are checked by their
+        innovations, and linear ones by operating points that are not zero.
 
     Returns
     -------
@@ -256,26 +257,26 @@ def run_on_data(
     Raises
     ------
     SpecError
-        Columns are missing or likely in another unit, a cell is no number, a time is missing, repeated, decreasing or
-        does not fit the design's dt (the row is named), or a file cannot be read or written.
+        Columns are missing or likely in another unit, a cell is not a number, a time is missing, repeated, decreasing
+        or inconsistent with the design's dt (the row is named), or a file cannot be read or written.
 
     Notes
     -----
-    Continuous-time observers are advanced from row to row by a first-order hold over the interval as it is: exact for
-    signals that are linear between rows.  In a row with a missing sample, and in a gap, the outputs of the plant model
-    (faults held at their last estimate, unknown inputs zero, started from the last state estimate) stand in for the
-    measured ones, so that the observer's state follows the model's; fault estimates are held, residuals are empty and
-    the status is ``gap``.  The observer starts again after a gap of more than 10,000 samples, where the model has lost
-    the plant (it misses the outputs by more than their size before and after the gap, as an unstable one will in the
-    end, and by more than becomes usual within a warm-up), and after every gap of a plant of index 2 or more, whose
+    Continuous-time observers are advanced from row to row by a first-order hold over the actual interval, which is
+    exact for signals that are linear between rows.  In a row with a missing sample, and in a gap, the outputs of the
+    plant's model replace the measured ones.  The model starts from the last state estimate, with faults held at their
+    last estimate and unknown inputs of zero.  Fault estimates are then held, residuals are empty and the status is
+    ``gap``.  The observer starts again after a gap of more than 10,000 samples; after a gap in which the model has lost
+    the plant, as an unstable one finally does (its outputs are wrong by more than their size before and after the gap,
+    and the effect does not become usual within a warm-up); and after every gap of a plant of index 2 or more, whose
     model cannot be propagated.  Intervals are rounded to the resolution of the time stamps.
 
-    Recursive and nonlinear designs take missing outputs themselves, with what they cost in the columns ``sd ...``
-    (standard deviations): a row without some outputs is ``partial``, one without all of them, or without an input, is a
-    ``gap``.  The first row is k = 0, of which recursive designs do not use the outputs.  Missing inputs are held,
-    within the largest changes that they have made before, by which deviations grow; the rows after that are
-    ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
-    (whitened, for recursive designs).
+    Recursive and nonlinear designs process missing outputs themselves, and the columns ``sd ...`` (standard deviations)
+    show their effect.  A row without some outputs is ``partial``; one without all of them, or without an input, is a
+    ``gap``.  The first row is k = 0, at which recursive designs do not use the outputs.  Missing inputs are held, and
+    deviations grow according to the largest earlier changes of these inputs; the rows after that are ``recovering``
+    until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before (whitened, for
+    recursive designs).
 
     Examples
     --------
@@ -318,7 +319,7 @@ def run_on_data(
     data = data if isinstance(data, str | Path) or hasattr(data, "readline") else as_frame(data)
     room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
     measured = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
-    # What has left a stream cannot be taken back: there the state is saved however the run ends.
+    # Output of a stream cannot be taken back, so that there the state is saved however the run ends.
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), run, digest)
@@ -344,17 +345,19 @@ def run_on_data(
 
 
 def _rows_to_run(data: Data, run: LogRun, stamps: Stamps, chunk_rows: int, *, resumed: bool) -> Iterator[FloatArray]:
-    """Return the rows of a log in chunks; those of a file are begun to be read, so that a header is only written where
-    they can be."""
-    # A log that is followed begins with the rows that the state has, and may have had many.
+    """Return the rows of a log in chunks.
+
+    The first chunk of a file is read at once, so that a header is only written if the file can be read.
+    """
+    # A followed log begins with the rows before the saved state, which may be many.
     after = run.clock.stamp if resumed and isinstance(data, FollowedLog) else None
     rows = chunks(data, run.signals, stamps, chunk_rows, after=after)
-    # Of a stream the header comes before the first row.
+    # For a stream the header is written before the first row is read.
     return rows if hasattr(data, "readline") else chain(list(islice(rows, 1)), rows)
 
 
 def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps, *, resumed: bool) -> DataRun:
-    """Return what happened in a run that has ended: counts of rows, alarms, outliers, stuck sensors and warnings."""
+    """Return the summary of a run that has ended: numbers of rows, alarms, outliers, stuck sensors and warnings."""
     runs_by_output = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
     stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in runs_by_output if runs}
     start = () if resumed else run.first.alarm_of_the_start(design, run.events.events(), warm_up=run.observer.warm_up)
@@ -389,7 +392,7 @@ def _summary_of(run: LogRun, design: ObserverDesign, digest: str, stamps: Stamps
 
 
 def _long_warm_up(run: LogRun, design: ObserverDesign) -> tuple[str, ...]:
-    """Return a text where most of the rows that could have been decided are warm-up."""
+    """Return a text if a large share of the rows is warm-up."""
     rows = run.events.silent[WARM_UP]
     if not rows or rows < LONG_SHARE * run.rows:
         return ()
@@ -405,7 +408,7 @@ def _long_warm_up(run: LogRun, design: ObserverDesign) -> tuple[str, ...]:
 
 
 def _require_files(*, state: Any, out: Any, data: object) -> None:
-    """Refuse files of `run_on_data` that are one, or cannot be written."""
+    """Refuse arguments of `run_on_data` that name the same file, or one that cannot be written."""
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     require_distinct(
@@ -420,7 +423,7 @@ def _require_files(*, state: Any, out: Any, data: object) -> None:
 
 
 def _require_a_window(design: ObserverDesign, rows: int) -> None:
-    """Raise `SpecError` where a log is shorter than the window of a guaranteed test, which then says nothing of it."""
+    """Raise `SpecError` if a log is shorter than the window of a guaranteed test, so that no row has a verdict."""
     if not is_guaranteed(design):
         return
     needed = max(map(rows_before, GuaranteedTest.of(design).tests)) + 1
@@ -433,7 +436,7 @@ def _require_a_window(design: ObserverDesign, rows: int) -> None:
 
 
 def _require_estimates(run: LogRun, stamps: Stamps) -> None:
-    """Raise `SpecError` where no row of a log has an estimate, as a column of it is empty."""
+    """Raise `SpecError` if no row of a log has an estimate since one of its columns is empty."""
     empty = stamps.measured.empty(run.signals.columns_and_signals())
     if empty and not run.statuses.keys() - {GAP, *STALE}:
         column, signal = empty[0]
@@ -441,7 +444,7 @@ def _require_estimates(run: LogRun, stamps: Stamps) -> None:
 
 
 def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:
-    """Let rows wait for those after them, if they shall."""
+    """Add a smoother to the run if ``smooth`` or ``lag`` is given."""
     if not smooth and lag is None:
         return
     if smooth and lag is not None:
