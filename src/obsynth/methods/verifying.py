@@ -91,7 +91,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
                 rows = (*rows, *stored_number_rows(design, model, gamma), *derivation_rows(design, model))
                 rows = (*rows, *_constant_fault_rows(method, shipped, printed_digits))
         if all(row.passed for row in rows):
-            rows = (*rows, *stored_twice_rows(shipped), *tolerance_rows(shipped))
+            rows = (*rows, *stored_twice_rows(shipped), *_recursive_plant_rows(shipped), *tolerance_rows(shipped))
             if own:
                 rows = (*rows, *_option_rows(method, shipped))
         covered = {name: meaning.row for name, meaning in method.claims.items()}
@@ -122,6 +122,15 @@ def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_
             ["nothing is claimed of constant faults here: leave steady_error_limit out"],
             source="options",
         )
+
+
+def _recursive_plant_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the rows on the plant as written of a recursive design; its analysis is imported for such a design only."""
+    if isinstance(design.observer, LinearObserver):
+        return
+    from obsynth.verification.recursive_plant import recursive_plant_rows
+
+    yield from recursive_plant_rows(design)
 
 
 def _existence_rows(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:

@@ -153,12 +153,12 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
     if not follows.passed:
         return
     if design.recovery is not None:
-        yield _recovery_row(derived.recovery, design.recovery)
+        yield recovery_as_written_row(derived.recovery, design.recovery)
     if source.sample_time is not None and observer.fault_names:
         yield from _sampling_rows(source.smooth, source.sample_time, plant, observer, model)
 
 
-def _recovery_row(derived: StateRecovery, own: StateRecovery) -> Check:
+def recovery_as_written_row(derived: StateRecovery, own: StateRecovery) -> Check:
     """Return the row that the states as written are recovered as they are by the steps done again: under their names
     and about their operating point, as they are printed.  States that a step before these has added have no row."""
     wrong = [name for name in own.names if name not in derived.names]
