@@ -1,7 +1,9 @@
 """The fault-estimation filter over the region of a polytopic plant: gains at the vertices, one certificate for all.
 
 Wang 2015, (45), with the vertices of A1 and T D: P and Y of `obsynth.conditions.polytope`, L of (60) at each vertex.
-``W = Upsilon^+ + V U2'`` with V a variable beside P and Y, so that neither states nor outputs have units that matter.
+``W = Upsilon^+ + V U2'`` with V a variable beside P and Y, in balanced units, so that neither states nor outputs have
+units that matter.  Where the disturbances can be decoupled, gains in closed form do it (`decoupled_gains`): a search
+ends some way before a gain of zero, and where depends on the outputs.
 """
 
 from __future__ import annotations
