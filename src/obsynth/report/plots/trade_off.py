@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +51,9 @@ FAILED = {"impossible": "x", "infeasible": "+", "unknown": "1", "unverified": "2
 
 #: At most so many lines get an entry of their own in the legend.
 MOST_LINES = 8
+
+#: So many cases have their names below, on several lines; all together have room for so many letters of a line.
+MOST_NAMED_CASES, LETTERS_OF_CASES = 12, 96
 
 
 @arguments_checked
@@ -228,6 +232,7 @@ def _number(design: ObserverDesign, name: str) -> float:
 def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: str | None = None) -> Figure:
     """Draw a claim of every case over a parameter, one line for each combination of the others."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
 
     along = _parameter(results, parameter)
     claim = _claim(results, claim, along)
@@ -243,7 +248,8 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
         panel.plot(
             [place for place, _ in points],
             [result.claims.get(claim, np.nan) for _, result in points],
-            linewidth=1.0,
+            # Between cases that only have names there is nothing.
+            linewidth=0.0 if along is None else 1.0,
             color=LINE_COLOURS[number % len(LINE_COLOURS)],
             marker=MARKERS[number % len(MARKERS)],
             markersize=4,
@@ -266,10 +272,12 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     values = [result.claims[claim] for result in results if claim in result.claims]
     if _spread(values):
         panel.set_yscale("log")
+    elif values and all(float(value).is_integer() for value in values):
+        panel.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     if along is not None and _spread([place for points in lines.values() for place, _ in points]):
         panel.set_xscale("log")
     if along is None:
-        _number_cases(panel, len(results))
+        _mark_cases(panel, [result.name for result in results])
     else:
         panel.set_xlabel(_claim_label(along, [result.facts.get("method", "") for result in results]))
     panel.set_ylabel(_claim_label(claim, [result.facts.get("method", "") for result in results]))
@@ -279,11 +287,17 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     return figure
 
 
-def _number_cases(panel: Axes, count: int) -> None:
-    """Mark the cases by whole numbers and leave space for all of them, also for those without the claim."""
+def _mark_cases(panel: Axes, names: Sequence[str]) -> None:
+    """Mark the cases by their names, many of them by whole numbers, and leave space for all of them, also for those
+    without the claim."""
     from matplotlib.ticker import MaxNLocator
 
-    panel.set_xlim(0.5, count + 0.5)
+    panel.set_xlim(0.5, len(names) + 0.5)
+    if len(names) <= MOST_NAMED_CASES:
+        letters = LETTERS_OF_CASES // len(names)
+        panel.set_xticks(range(1, len(names) + 1), [fill(name, letters) for name in names])
+        panel.set_xlabel("case")
+        return
     panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     panel.set_xlabel("case (row of the table)")
 
