@@ -1,4 +1,4 @@
-"""Numbers about a recursive observer that do not depend on data: contraction of the errors, excitation, last gains."""
+"""Properties of a recursive observer that do not depend on data: contraction of errors, excitation, last gains."""
 
 from __future__ import annotations
 
@@ -18,71 +18,71 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.sample import deviations_in
 from obsynth.observers.recursive.steady_filter import settled_contraction
 
-#: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
+#: If a product of steps is below this, it is normalised, so that it does not underflow.
 GONE = 1e-200
 
-#: A product of later steps is given another unit where its entries are so many times larger or smaller than one.
+#: A product of later steps is normalised if its entries are so many times larger or smaller than one.
 FAR_FROM_ONE = 1e20
 
-#: A norm below this share of the largest one is smaller, whatever rounding did to both.
+#: A norm below this share of the largest one is smaller despite rounding of both.
 NEAR_GROWTH = 1.0 - 1e-10
 
-#: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
+#: On shorter horizons an error may not have decayed yet, so that the contraction is only reported, and not checked.
 STEPS_TO_CONTRACT = 50
 
-#: With a plant and noise that stay the same so many steps are followed at first. Where errors do not shrink over these,
-#: or the gains still move, it is `FOLLOW_FURTHER` times as many, until all were followed.
+#: For a constant plant with constant noise, so many steps are examined first.  If errors do not decay over these, or if
+#: the gains still change, `FOLLOW_FURTHER` times as many are examined, up to all.
 FIRST_FOLLOWED = 100
 
-#: With more states fewer steps are followed at first, as work goes with the cube of the states.
+#: With more states fewer steps are examined first, since the work grows with the cube of the number of states.
 MANY_STATES = 100
 
 FEWEST_FOLLOWED = 60
 
 FOLLOW_FURTHER = 3
 
-#: Gains that moved by less than this share of them over the second half of the steps have come to stay.
+#: Gains count as steady if they change by less than this share over the second half of the steps.
 STEADY_GAINS = 1e-9
 
-#: Spectral radius below which gains that are kept make errors decay, whatever rounding did to it.
+#: Errors with constant gains decay despite rounding if the spectral radius is below this.
 CLEARLY_STABLE = 1.0 - 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class GainScheduleSummary:
-    """What the gains along the horizon say."""
+    """Properties of the gains along the horizon."""
 
-    steps: int  # how many steps were looked at
-    # ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
-    # below one, over the second half of the horizon; else, of gains that tend to a steady state, the radius there
+    steps: int  # number of examined steps
+    # ``norm(product of L_k A_k)^(1 / steps)``, the mean factor of an error in a step.  If it is not below one, the same
+    # over the second half of the horizon, or else the spectral radius of the steady state that the gains tend to.
     contraction: float
-    settles: bool  # whether the contraction is that of the steady state: errors have not shrunk along these steps
-    growth: float  # the largest norm of the product on the way: how much an error may grow before it decays
-    span: str  # what the contraction was taken over
-    # ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last
+    settles: bool  # whether the contraction is that of the steady state, since errors do not decay in these steps
+    growth: float  # largest norm of the product: the factor by which an error may grow before it decays
+    span: str  # text on the steps that the contraction belongs to
+    # ``(nx,)``: size of the product in each state after the last step, relative to the largest: where errors remain
     survivors: FloatArray
-    # the least eigenvalue of the information on the parameters in any window, (26); NaN without parameters
+    # Least eigenvalue of the information on the parameters in any window, (26); NaN without parameters.
     excitation: float
-    excitation_k: int  # the sample that ends that window
-    L: FloatArray  # L, K: the gains (11) of the last step
+    excitation_k: int  # last sample of that window
+    L: FloatArray  # L and K: the gains (11) of the last step
     K: FloatArray
     deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters after the last step
-    # ``(nx,)``: standard deviations of the states after the last step, the parameters being known
+    # ``(nx,)``: standard deviations of the states after the last step for known parameters
     state_deviations: FloatArray
 
 
-def looked_at(observer: RecursiveObserver) -> int:
-    """Return how many steps of an observer's model are looked at."""
+def examined_steps(observer: RecursiveObserver) -> int:
+    """Return the number of steps of an observer's model that are examined."""
     steps = observer.plant.horizon or STEPS_WITHOUT_HORIZON
     return max(steps - 1, 1) if observer.early_constraints else steps
 
 
 def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_steps) -> GainScheduleSummary:
-    """Return what the gains along the horizon say."""
-    steps = looked_at(observer)
+    """Return the properties of the gains along the horizon."""
+    steps = examined_steps(observer)
     learning = observer.adaptation is not None
     random_walk = observer.form == "random-walk"
-    # Of a walk, the state filter and the regressors are those of the model without the walk.
+    # The state filter and the regressors of a random walk are those of the model without the walk.
     plain = observer.without_walk
     all_steps = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, all_steps)), [], None
@@ -136,13 +136,13 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
 
 @remembered
 def shared_summary(observer: RecursiveObserver) -> GainScheduleSummary:
-    """Return the same, once for an observer: of many states synthesis and verification would follow steps for seconds
-    each, of the same matrices that never change."""
+    """Return the same, computed once for an observer: for many states synthesis and verification would each take
+    seconds, with the same constant matrices."""
     return gain_schedule_summary(observer, gains=shared_gains)
 
 
 def _first_end(observer: RecursiveObserver, steps: int) -> int:
-    """Return how many steps are followed at first: all, but for a filter whose steps are all alike."""
+    """Return the number of steps that are examined first: all, except for a plant and noise that are constant."""
     plant = observer.plant
     alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
     if not alike or plant.horizon or observer.adaptation is not None:
@@ -153,20 +153,22 @@ def _first_end(observer: RecursiveObserver, steps: int) -> int:
 
 
 def end_of_steps(steps: int, all_steps: int) -> int:
-    """Return where to look next: so many steps, or all where they are not twice as many: a later end must have less
-    than half of its steps behind it, as the second half is looked at by itself."""
+    """Return the next number of steps to examine: ``steps``, or all if these are at most twice as many.
+
+    Less than half of the steps up to a later end may be done before it is set, since the second half is examined alone.
+    """
     return steps if 2 * steps < all_steps else all_steps
 
 
 def _stays(gain: FloatArray, before: FloatArray | None) -> bool:
-    """Whether a gain is where it was some time before."""
+    """Whether a gain is the same as some time before."""
     if before is None or before.shape != gain.shape:
         return False
     return bool(np.abs(gain - before).max(initial=0.0) <= STEADY_GAINS * np.abs(gain).max(initial=0.0))
 
 
 class ErrorProduct:
-    """The product of the matrices L_k A_k along so many steps, with its size on the way."""
+    """The product of the matrices L_k A_k over a number of steps, with its largest norm."""
 
     def __init__(self, nx: int, steps: int) -> None:
         self.steps, self.done = steps, 0
@@ -176,12 +178,12 @@ class ErrorProduct:
         self.ended: tuple[float, str] | None = None
 
     def go_on_to(self, steps: int) -> None:
-        """Go on to a later end, of which less than half is done."""
+        """Set a later end, up to which less than half of the steps are done."""
         self.steps = steps
         self.late, self.late_logarithm = np.eye(len(self.late)), 0.0
 
     def move(self, factor: FloatArray) -> None:
-        """Take one step more; nothing but the count changes once errors are gone or out of range."""
+        """Multiply by the matrix of one more step; once errors are zero or overflow, only the count changes."""
         self.done += 1
         if self.ended is not None:
             return
@@ -193,17 +195,18 @@ class ErrorProduct:
             self.middle = self._length()
         elif self.done > self.steps // 2:
             self.late = factor.dot(self.late)
-            # Singular values of every step would be most of the work: what is far from one is made one.
+            # Normalised only if its size is far from one, since singular values in every step would be most of the
+            # work.
             if not is_near_one(self.late):
                 late_size = norm_or_bound(self.late)
                 self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
 
     def _goes_on(self) -> bool:
-        """Take the norm for the growth, give the product another unit where it would underflow; False at an end."""
+        """Update the growth, and normalise the product where it would underflow; return whether to go on."""
         if len(self.product) <= MANY_STATES:
             flat = self.product.ravel()
-            # The Frobenius norm is at most so many times the norm, and not below it. Unlike `dot`, `vdot` does not warn
-            # where it overflows.
+            # The Frobenius norm is an upper bound of the norm, and at most sqrt(nx) times larger.  Unlike `dot`, `vdot`
+            # does not warn of overflow.
             above = math.sqrt(np.vdot(flat, flat))
             if len(flat) * GONE < above < NEAR_GROWTH * self.growth:
                 return True
@@ -227,20 +230,21 @@ class ErrorProduct:
         return np.asarray(sizes / max(float(sizes.max()), np.finfo(np.float64).tiny))
 
     def contraction_of_kept_gains(self) -> tuple[float, str] | None:
-        """Return the contraction of one step with the last gains, were they kept; ``None`` where errors stay then."""
+        """Return the contraction of one step with the last gains as constant gains; ``None`` if errors do not decay."""
         radius = 1.0 if self.ended is not None else spectral_radius(self.factor)
         span = "of one step with the last gains, were they kept: errors have not shrunk as a whole yet"
         return (radius, span) if radius < CLEARLY_STABLE else None
 
     def contraction(self) -> tuple[float, str]:
-        """Return the mean factor by which an error shrinks in a step, and what it was taken over."""
+        """Return the mean factor of an error in a step, and a text on the steps that it belongs to."""
         if self.ended is not None:
             return self.ended
         steps = self.steps
         last = self._length()
         per_step = float(np.exp(last / steps))
-        # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to
-        # make an error smaller than it was: then errors must shrink over the second half, as a whole and in every mode.
+        # With very different units, or if errors grow before they decay, an error of a slow mode may not be smaller at
+        # the end of the horizon than at its start.  Then errors must decay over the second half, in norm and by the
+        # spectral radius.
         radius = spectral_radius(self.late) if per_step >= 1.0 else 1.0
         slowest = max(last - self.middle, self.late_logarithm + float(np.log(radius)) if radius else -np.inf)
         second = float(np.exp(slowest / (steps - steps // 2)))
@@ -250,7 +254,7 @@ class ErrorProduct:
 
 
 def is_near_one(matrix: FloatArray) -> bool:
-    """Whether the largest entry of a matrix is within `FAR_FROM_ONE`, which of few entries their squares can tell."""
+    """Whether the largest entry of a matrix is within `FAR_FROM_ONE` of one; the sum of squares often suffices."""
     squares = float(np.vdot(matrix, matrix))
     if matrix.size / FAR_FROM_ONE < squares < FAR_FROM_ONE:
         return True
@@ -258,8 +262,8 @@ def is_near_one(matrix: FloatArray) -> bool:
 
 
 def norm_or_bound(matrix: FloatArray) -> float:
-    """Return the 2-norm of a matrix; of a large one a bound on it, which takes no singular values."""
+    """Return the 2-norm of a matrix; for a large one an upper bound, without singular values."""
     if len(matrix) <= MANY_STATES:
-        # What `norm` does of one matrix, without asking thousands of times which axes it has.
+        # The same as `norm`, without its checks of axes, which would run thousands of times.
         return float(np.linalg.svd(matrix, compute_uv=False).max(initial=0.0))
     return float(np.sqrt(np.linalg.norm(matrix, 1) * np.linalg.norm(matrix, np.inf)))

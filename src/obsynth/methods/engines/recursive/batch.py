@@ -10,7 +10,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, ROUNDED_BESIDE, numerical_rank, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
-from obsynth.observers.recursive.gain_schedule_summary import looked_at
+from obsynth.observers.recursive.gain_schedule_summary import examined_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices
 
@@ -27,7 +27,7 @@ RECORD_SEED = 2013
 def batch_steps(stated: RecursiveObserver) -> int:
     """Return how many steps the size of a plant allows in one batch."""
     rows = len(stated.recursion.model.at(0).H)
-    return min(BATCH_STEPS, looked_at(stated), max(2, (MOST_BATCH_ROWS - stated.plant.nx) // rows))
+    return min(BATCH_STEPS, examined_steps(stated), max(2, (MOST_BATCH_ROWS - stated.plant.nx) // rows))
 
 
 def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:

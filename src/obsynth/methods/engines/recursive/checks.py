@@ -29,7 +29,7 @@ from obsynth.observers.recursive.gain_schedule import shared_gains
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
-    looked_at,
+    examined_steps,
     shared_summary,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -154,14 +154,14 @@ def _dynamic_rows(
         yield from _parameter_information(observer, observer.adaptation.window, facts)
     yield listed_gains(design, {"L": facts.L, "K": facts.K}, tolerance=CLAIM_TOLERANCE)
     yield _claims(design, facts, ranks)
-    yield from consistency(stated, observer, looked_at(observer), gains=gains)
+    yield from consistency(stated, observer, examined_steps(observer), gains=gains)
 
 
 def _batch_rows(stated: RecursiveObserver, observer: RecursiveObserver, condition: float) -> Iterator[Check]:
     """Yield the rows that the recursion is the least-squares solution; ``condition`` is that of H."""
     in_batch = batch_steps(stated)
     span = f"{in_batch} steps at once" + (
-        ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
+        ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, examined_steps(stated)) else ""
     )
     for name, gap in batch_residuals(stated, observer).items():
         yield upper_bound_check(
@@ -286,7 +286,7 @@ def misfit(design: ObserverDesign) -> str:
         name: (matrix, observer.plant.matrices[name]) for name, matrix in plant.matrices.items()
     }
     pairs |= {"Q": (stated.Q, observer.Q), "R": (stated.R, observer.R)}
-    steps = looked_at(stated)
+    steps = examined_steps(stated)
     for name, (first, second) in pairs.items():
         begin = 1 if name in ("E", "C") else 0
         last = begin + 1 if first.is_constant and second.is_constant else begin + steps
