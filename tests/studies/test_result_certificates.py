@@ -320,6 +320,18 @@ def test_a_figure_in_small_units_is_compared_with_those_of_its_unit(name: str) -
     assert differences({**figures, "unknown_input_share": 1e-6}, figures) == ["unknown_input_share"]
 
 
+def test_figures_of_robustness_are_not_compared_with_others_beside_them() -> None:
+    """A radius of 1e-7 beside a factor of a million, or farads beside ohms, could be replaced by another."""
+    claims = {"loop_radius": 1e-7, "largest_factor": 1e6, "breaking": {"resistance": 1e4, "capacity": 2e-12}}
+    assert differences({**claims, "loop_radius": 9e-4}, claims) == ["loop_radius"]
+    for name, value in (("capacity", 1e-6), ("capacity", 2.1e-12), ("resistance", 1.01e4)):
+        assert differences({**claims, "breaking": {**claims["breaking"], name: value}}, claims) == [f"breaking, {name}"]
+    # What is rounding beside one is the same on another processor.
+    assert not differences({**claims, "loop_radius": 1e-7 + 1e-12, "largest_factor": 1e6 + 1e-3}, claims)
+    rounded = {"resistance": 1e4 + 1e-8, "capacity": 2e-12 + 1e-24}
+    assert not differences({**claims, "breaking": rounded}, claims)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_content_fails_as_contents(files: dict[str, Path], tmp_path: Path, kind: str) -> None:
     for key, value in (("asked", {}), ("asked", None), ("result", {}), ("log", 3), ("statement", None)):

@@ -33,12 +33,15 @@ SHOWN_DIGITS = 12
 #: Figures that are found again agree to this share of themselves, or of the largest of their unit beside them.
 SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
 
-#: Figures of a fault's estimate that are without a unit, and those that have one together: seconds, the fault's own.
-SHARES = frozenset({"at_horizon", "peak", "relative_error", "unknown_input_share"})
+#: Figures without a unit, beside which one is the size of all; those of a fault's estimate that have a unit together:
+#: seconds, the fault's own.
+SHARES = frozenset({"at_horizon", "peak", "relative_error", "unknown_input_share", "loop_radius", "largest_factor"})
 SAME_UNIT = (
     frozenset({"detection_delay", "half", "horizon", "most"}),
     frozenset({"bias", "bound", "deviation", "least", "rms", "size", "smallest_found", "threshold"}),
 )
+#: A mapping of constants, each in a unit of its own: ohms beside farads.
+CONSTANTS = "breaking"
 
 #: Bytes in which a file says its kind.
 _CERTIFICATE_HEAD_BYTES = 200
@@ -106,6 +109,8 @@ def differences(stored: Any, again: Any, where: str = "") -> list[str]:
         items = [(str(i + 1), before, after) for i, (before, after) in enumerate(zip(stored, again, strict=True))]
     else:
         return [] if _same_figure(stored, again, 0.0) else [where]
+    if where == CONSTANTS:
+        return [f"{where}, {name}" for name, before, after in items if not _same_figure(before, after, 0.0)]
     figures = {name: abs(float(after)) for name, _, after in items if _is_figure(after) and abs(after) < float("inf")}
     wrong = []
     for name, before, after in items:
