@@ -388,6 +388,7 @@ def test_an_estimate_that_is_not_watched_says_how_many_rows_it_needs_and_a_level
     plant = obsynth.DescriptorSystem(
         None, [[0.9, 0.05], [0.0, 0.8]], [[1.0], [0.5]], ["T1", "T2"], Bf=[[1.0], [0.0]], dt=1.0,
         state_names=["T1", "T2"], input_names=["heat"], fault_names=["loss"], sensor_noise={"T1": 0.05, "T2": 0.05},
+        units={"loss": "kW"},
     )  # fmt: skip
     design, rng, x, rows = obsynth.ui_pi_observer(plant), np.random.default_rng(1), np.zeros(2), []
     slow = 0.0
@@ -400,7 +401,11 @@ def test_an_estimate_that_is_not_watched_says_how_many_rows_it_needs_and_a_level
     assert "fhat[loss]" in learned.left_out
     (note,) = (note for note in learned.notes if note.startswith("fhat[loss] is not watched"))
     assert int(note.split("about ")[1].split(" ")[0].replace(",", "")) > learned.rows
-    level = float(note.split("such as ")[1].split(",")[0])
+    # Both numbers had no unit.
+    assert " kW at most here" in note
+    text, unit = note.split("such as ")[1].split(",")[0].split()
+    level = float(text)
+    assert unit == "kW"
     monitor = obsynth.online_monitor(design, "learned", normal=learned)
     alarm = obsynth.run_on_data(design, data, monitor=monitor, thresholds={"fhat[loss]": level}).table["alarm"]
     assert (alarm[:250] == "").all()

@@ -236,7 +236,7 @@ def _notes_of_output(
         *notes_of_normal_rows(
             raised, output.numbers, logs.rows[:, 0], chosen, logs.stuck, logs.ends, list(logs.stamps)
         ),
-        *notes_of_left_out(left_out_estimates(design, learned, output.watched), learned),
+        *notes_of_left_out(left_out_estimates(design, learned, output.watched), learned, design.plant.units),
     ]
 
 

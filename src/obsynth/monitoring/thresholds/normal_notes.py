@@ -13,6 +13,7 @@ from obsynth.monitoring.thresholds.learned import LearnedThresholds, duration
 from obsynth.monitoring.thresholds.learned_from_rows import LeftOut, Raised
 from obsynth.monitoring.thresholds.learned_levels import CHANCE_DEVIATIONS, normal_scores
 from obsynth.numerics.arrays import FloatArray
+from obsynth.results.number_texts import number
 
 #: An input counts as moving in a row if it changes by more than so many times its median change.  A held input moves
 #: wherever it changes, and a sine nowhere.
@@ -109,8 +110,10 @@ def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
     )
 
 
-def notes_of_left_out(estimates: Sequence[LeftOut], learned: LearnedThresholds) -> tuple[str, ...]:
-    """Return notes on estimates of faults that are not watched."""
+def notes_of_left_out(
+    estimates: Sequence[LeftOut], learned: LearnedThresholds, units: Mapping[str, str]
+) -> tuple[str, ...]:
+    """Return notes on estimates of faults that are not watched; ``units``: of the plant's signals, by name."""
 
     def reason(estimate: LeftOut) -> str:
         if estimate.is_redundant:
@@ -121,12 +124,18 @@ def notes_of_left_out(estimates: Sequence[LeftOut], learned: LearnedThresholds) 
             return f"it varies too slowly for {learned.rows:,} rows; {needed}"
         return "it follows something slow or periodic in these rows, which is no noise"
 
-    return tuple(
-        f"{estimate.name} is not watched: {reason(estimate)}. It is {estimate.largest:.3g} at most here: a level above "
-        f"(--threshold, thresholds), such as {ROOM_ABOVE * estimate.largest:.2g}, alarms for as long as a fault lasts, "
-        "with no rate that is known."
-        for estimate in estimates
-    )
+    def note(estimate: LeftOut) -> str:
+        unit = units.get(estimate.name.removeprefix("fhat[").removesuffix("]"), "1")
+        largest, level = number(estimate.largest, digits=3), number(ROOM_ABOVE * estimate.largest, digits=2)
+        if unit not in ("", "1"):
+            largest, level = f"{largest} {unit}", f"{level} {unit}"
+        return (
+            f"{estimate.name} is not watched: {reason(estimate)}. It is {largest} at most here: a level above "
+            f"(--threshold, thresholds), such as {level}, alarms for as long as a fault lasts, with no rate that is "
+            "known."
+        )
+
+    return tuple(note(estimate) for estimate in estimates)
 
 
 def _larger_at_moves(sizes: FloatArray, inputs: FloatArray) -> tuple[int, float]:
