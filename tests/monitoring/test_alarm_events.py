@@ -79,8 +79,8 @@ def test_the_share_of_time_in_alarm_is_told_beside_the_events():
     both = (one, replace(one, first_row=41, last_row=41, rows=1), replace(one, by="fhat[f]", rows=3))
     assert rows_in_alarm(both) == {"nis": 8, "fhat[f]": 3}
     assert time_in_alarm(both, 80) == [
-        "In alarm by nis: 8 of 80 rows (10 %), 2 alarms, the longest over 10 rows.",
-        "In alarm by fhat[f]: 3 of 80 rows (3.75 %), 1 alarm, the longest over 10 rows.",
+        "In alarm by nis: 8 of 80 rows (10 %), 2 alarms, the longest 10 rows from first to last.",
+        "In alarm by fhat[f]: 3 of 80 rows (3.75 %), 1 alarm, 10 rows from first to last.",
     ]
     assert time_in_alarm((), 80) == []
 

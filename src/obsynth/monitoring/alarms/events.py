@@ -376,7 +376,8 @@ def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
         own = [event for event in events if event.by == by]
         longest = max(event.last_row - event.first_row + 1 for event in own)
         alarms, lasting = (f"{n} {noun}{'s' if n != 1 else ''}" for n, noun in ((len(own), "alarm"), (longest, "row")))
-        alarms_text = f"{alarms}, the longest over {lasting}"
+        # Rows between the first and the last that are below the threshold are not counted before it.
+        alarms_text = f"{alarms}, {'' if len(own) == 1 else 'the longest '}{lasting} from first to last"
         sentences.append(f"In alarm by {by}: {count} of {rows} rows ({100.0 * count / rows:.3g} %), {alarms_text}.")
     return sentences
 
