@@ -31,6 +31,7 @@ from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression
+from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.estimates import DAERow
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -53,6 +54,9 @@ COUNTED = FOLLOWED * 2**MOST_DOUBLINGS
 MOST_NUMBERS = 2_000_000
 
 
+_NOTHING = read_only(np.zeros(0))
+
+
 class EffectState(NamedTuple):
     """The state of `FaultEffects`, for ``b`` candidate begins."""
 
@@ -71,6 +75,10 @@ class EffectState(NamedTuple):
     alarmed: float = 0.0  # alarmed, quiet: rows in alarm, and rows since the last of them
     quiet: float = 0.0
     earlier: EarlierChanges = EarlierChanges()  # named changes, whose effects are subtracted from later rows
+    shown: FloatArray = _NOTHING  # ``(b, nf, h)``: effects on the fault estimates after the last sample
+    spread: FloatArray = _NOTHING  # ``(nf, nf)``: covariance of these, NaN before the first sample
+    scored: FloatArray = _NOTHING  # scored, informed: ``(b, h)``: of the scores of the faults
+    informed: FloatArray = _NOTHING
 
 
 class Seen(NamedTuple):
@@ -82,8 +90,6 @@ class Seen(NamedTuple):
     there: NDArray[np.bool_]
     judged: NDArray[np.bool_]
 
-
-_NOTHING = read_only(np.zeros(0))
 
 #: The state of a rule without a ranking.
 NO_EFFECTS = EffectState(
@@ -97,6 +103,7 @@ class FaultEffects(ABC):
     def __init__(self, faults: Sequence[str], outputs: Sequence[str], learned: LearnedThresholds) -> None:
         self.hypotheses: tuple[Hypothesis, ...] = hypotheses_of(faults, outputs)
         self.model = learned.statistics.model
+        self.walk: FloatArray | None = None
 
     @property
     @abstractmethod
@@ -112,11 +119,60 @@ class FaultEffects(ABC):
     def init(self) -> EffectState:
         """Return the state before the first sample."""
         (n, order), h, m, b = self.sizes, len(self.hypotheses), self.model.channels, BEGINS + HELD
-        return EffectState(
+        state = EffectState(
             np.full(b, np.nan), np.zeros(b), np.zeros((b, n, h)), np.zeros((b, order, m, h)), np.zeros((b, h)),
             np.zeros((b, h)), np.zeros((b, m)), np.zeros(b), np.zeros(b),
             earlier=EarlierChanges.none(b, m, h),
         )  # fmt: skip
+        if self.walk is None:
+            return state
+        nf = len(self.walk)
+        return state._replace(
+            shown=np.zeros((b, nf, h)), spread=np.full((nf, nf), np.nan), scored=np.zeros((b, h)),
+            informed=np.zeros((b, h)),
+        )  # fmt: skip
+
+    def with_scores(self, before: EffectState, state: EffectState, observation: Any, away: FloatArray) -> EffectState:
+        """Return the state after the score of a sample ``away (nf,)`` from the centres of the faults; ``before``: the
+        state before the sample."""
+        if self.walk is None or not isinstance(observation, DAERow) or observation.k == 0:
+            return state
+        spread = np.asarray(observation.parameter_covariance)
+        shown = self._shown(state)
+        state = state._replace(shown=shown, spread=spread)
+        if not np.isfinite(before.spread).all():
+            return state
+        is_older = (state.begun < state.row)[:, None, None]
+        earlier = np.where(is_older, before.shown, 0.0)
+        with np.errstate(all="ignore"):
+            own, prior = np.linalg.inv(spread), np.linalg.inv(before.spread + self.walk)
+            information = 0.5 * (own - prior + (own - prior).T)
+            units = np.sqrt(np.maximum(np.diag(information), 0.0))
+            if not (units > 0.0).all():
+                return state
+            sizes, vectors = np.linalg.eigh(information / np.outer(units, units))
+            weights = np.where(sizes > DIRECTION_SHARE * sizes[-1], 1.0 / sizes, 0.0)
+            inverse = (vectors * weights) @ vectors.T / np.outer(units, units)
+            effects = own @ shown - prior @ earlier
+            rows = state.row - state.begun + 1.0
+            counted = (np.isfinite(state.begun) & (rows <= COUNTED))[:, None]
+            scored = state.scored + counted * np.einsum("bfh,f->bh", effects, inverse @ away)
+            informed = state.informed + counted * np.einsum("bfh,fg,bgh->bh", effects, inverse, effects)
+        if not (np.isfinite(scored).all() and np.isfinite(informed).all()):
+            return state
+        return state._replace(scored=scored, informed=informed)
+
+    def _shown(self, state: EffectState) -> FloatArray:
+        """Return the effects on the fault estimates after a sample; of filters whose faults walk."""
+        raise NotImplementedError
+
+    def ranked_by_scores(self, state: EffectState) -> Ranking | None:
+        """Return the ranking by the scores of the faults, where no residual shows a change."""
+        if self.walk is None:
+            return None
+        nothing = np.zeros((len(state.scored), 1))
+        explanation, _ = _explanation(state.scored, state.informed, nothing, nothing[:, 0])
+        return ranked(self.hypotheses, explanation._replace(shift=float(explanation.ratios.max())))
 
     def step(
         self, state: EffectState, observation: Any, white: FloatArray, seen: Seen | None, share: float
@@ -183,6 +239,9 @@ class FaultEffects(ABC):
         for part in (error, past, score, information, sums, counts, held):
             part[place] = 0.0
         self._at_begin(error[place])
+        of_scores = [np.array(part) for part in (state.shown, state.scored, state.informed)]
+        for part in of_scores if self.walk is not None else ():
+            part[place] = 0.0
         earlier = state.earlier
         if quiet > HOLD:
             held[:] = 0.0
@@ -195,7 +254,7 @@ class FaultEffects(ABC):
         alarmed = state.alarmed if quiet <= HOLD else 0.0
         return EffectState(
             begun, until, error, past, score, information, sums, counts, held, row, alarmed, quiet,
-            earlier.with_begin(place),
+            earlier.with_begin(place), of_scores[0], state.spread, *of_scores[1:],
         )  # fmt: skip
 
     def explained(self, state: EffectState) -> tuple[EffectState, Ranking | None]:
@@ -275,7 +334,7 @@ class FilterEffects(FaultEffects):
     def __init__(self, observer: DAEObserver, learned: LearnedThresholds) -> None:
         faults, outputs = observer.fault_names, observer.plant.output_names
         super().__init__(faults, outputs, learned)
-        self.R = observer.R
+        self.R, self.walk = observer.R, parameter_walk(observer)
         self._shapes = len(observer.state_names), len(faults), len(outputs)
         rows = [f"fhat[{name}]" for name in faults] + [f"r[{name}]" for name in outputs]
         self._places = np.array([rows.index(name) for name in learned.columns])
@@ -307,11 +366,22 @@ class FilterEffects(FaultEffects):
         effect[:, outputs, sensors + ny] += rows[:, None]
         effect[:, ~observation.measured] = 0.0
         error = error - _gain(observation, reading, self.R) @ effect
+        estimates = self._estimates(error, rows)
+        effects = np.concatenate([estimates, effect], axis=1)[:, self._places]
+        return error, *_whitened(self.model, state.past, effects, seen)
+
+    def _estimates(self, error: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the effects on the fault estimates ``(b, nf, h)``."""
+        nx, nq, _ = self._shapes
+        moved = np.arange(nq)
         estimates = -error[:, nx:]
         estimates[:, moved, moved] += 1.0
         estimates[:, moved, nq + moved] += rows[:, None]
-        effects = np.concatenate([estimates, effect], axis=1)[:, self._places]
-        return error, *_whitened(self.model, state.past, effects, seen)
+        return np.asarray(estimates)
+
+    def _shown(self, state: EffectState) -> FloatArray:
+        rows = np.where(np.isfinite(state.begun), state.row - state.begun + 1.0, 0.0)
+        return self._estimates(state.error, rows)
 
 
 class LinearEffects(FaultEffects):

@@ -293,7 +293,10 @@ class LearnedRule(Rule):
             state = state._replace(effects=effects)
             if ranking is None and self._walk is not None:
                 by_fault = statistics[-2 * len(self._faults) :].reshape(2, -1)
-                ranking = ranked_changes(self._names, self._changes(state, 0.0), by_fault.max(axis=0) > 1.0)
+                if (by_fault > 1.0).any():
+                    ranking = self.effects.ranked_by_scores(state.effects)
+                if ranking is None:
+                    ranking = ranked_changes(self._names, self._changes(state, 0.0), by_fault.max(axis=0) > 1.0)
         return state, RuleOutput(largest, 1.0, fault, (), ranking)
 
     def _followed(
@@ -303,7 +306,11 @@ class LearnedRule(Rule):
         measured, and whose whitened values were scaled by ``share``."""
         if self.effects is None:
             return state
-        return state._replace(effects=self.effects.step(state.effects, observation, state.white[-1], seen, share))
+        before = state.effects
+        effects = self.effects.step(before, observation, state.white[-1], seen, share)
+        if self._walk is not None:
+            effects = self.effects.with_scores(before, effects, observation, state.scores[-1, : len(self._walk)])
+        return state._replace(effects=effects)
 
     def _raised(self, before: FloatArray, sample: Sample, missing: int) -> FloatArray:
         """Return how far the inputs of the last rows are beyond their ranges ``(ages, nu)``, with those of a sample and
