@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.report.plants import is_unclear
+from obsynth.report.plants import is_unclear, method_lines
 
 
 def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
@@ -31,6 +31,9 @@ def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
     (row,) = [row for row in obsynth.check(plant)["ui-pi-observer"].failures if row.unclear]
     assert row.name == "exists: (D3) fault model at 1"
     assert is_unclear([row])
+    ((_, text, _),) = method_lines({"ui-pi-observer": obsynth.VerificationReport.of([row])})
+    assert text.startswith("UNCLEAR for this plant: the condition '(D3) fault model at 1' is not decided. Needed: ")
+    assert "Found: Unclear" not in text
     assert not is_unclear([dataclasses.replace(row, unclear=False)])
     report = obsynth.VerificationReport.of([row, dataclasses.replace(row, name="other", unclear=False)])
     assert obsynth.VerificationReport.from_dict(report.as_dict()) == report

@@ -268,11 +268,13 @@ def _reason(failed: Sequence[Check]) -> str:
     # What no observer of this kind can do without comes first.
     first, *more = sorted(failed, key=lambda check: check.of_the_method)
     condition = "the method's condition" if first.of_the_method else "the condition"
-    sentence = f"{condition} '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
-    sentence += f". Found: {first.detail}".rstrip(".") if first.detail else ""
-    return f"{sentence}." + (
-        f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else ""
-    )
+    verdict = "is not decided" if first.unclear else "FAILS"
+    sentence = f"{condition} '{first.name.removeprefix('exists: ')}' {verdict}. Needed: {first.claim}".rstrip(".")
+    sentence += f". Found: {first.detail.removeprefix('Unclear: ')}".rstrip(".") if first.detail else ""
+    if not more:
+        return f"{sentence}."
+    singular, plural = ("is not decided", "are not decided") if is_unclear(failed) else ("fails", "fail")
+    return f"{sentence}. {len(more)} more condition{f' {singular}' if len(more) == 1 else f's {plural}'} (-v)."
 
 
 def linear_plant_text(plant: DescriptorSystem) -> str:
