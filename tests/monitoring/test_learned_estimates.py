@@ -35,6 +35,7 @@ from obsynth.monitoring.thresholds.parameter_scores import (
     change_ratios,
     most_likely_change,
     parameter_walk,
+    precisions,
     sample_score,
 )
 from obsynth.numerics.autoregression import fitted_autoregression
@@ -170,6 +171,9 @@ def test_a_covariance_that_starts_again_says_nothing() -> None:
         return SimpleNamespace(theta=np.array([theta]), parameter_covariance=np.array([[variance]]))
 
     walk = np.array([[0.1]])
+    assert precisions(np.array([[1.0]]), np.array([[5.0]]), walk, 1) is None
+    assert precisions(np.array([[1.0]]), np.array([[0.0]]), walk, 1) is None
+    assert precisions(np.array([[np.nan]]), np.array([[1.0]]), walk, 1) is None
     before, first = sample_score(before_any(1), evidence(3.0, 1.0), walk, 1)
     assert not first.information.any()
     _, again = sample_score(before, evidence(0.0, 5.0), walk, 1)

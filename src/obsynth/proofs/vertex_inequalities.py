@@ -28,7 +28,7 @@ the weights are that do not depend on w.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -87,6 +87,11 @@ class Witness:
     def order(self) -> int:
         """Number of errors."""
         return len(self.P[0])
+
+    def in_units(self, states: FloatArray) -> Witness:
+        """Return the matrices for errors ``diag(states) e``, where these are for e: ``S^-1 P S^-1``."""
+        P = [matrix / states / states[:, None] for matrix in self.P]
+        return replace(self, P=P, G=None if self.G is None else [m / states / states[:, None] for m in self.G])
 
     def pairs_of(self, count: int) -> list[Pair]:
         """Return the pairs of weights at which the inequalities are proved."""

@@ -122,14 +122,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
     source = design.source
     if source is None:
         if design.recovery is not None:
-            yield information(
-                "plant as written",
-                "elimination, sampling and recovery are those of the plant as written: assumed, as "
-                "the design does not hold it",
-                np.nan,
-                source="given by hand",
-                status="assumed",
-            )
+            yield assumed_recovery_row()
         return
     try:
         derived = source.derived
@@ -156,6 +149,17 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
         yield recovery_as_written_row(derived.recovery, design.recovery)
     if source.sample_time is not None and observer.fault_names:
         yield from _sampling_rows(source.smooth, source.sample_time, plant, observer, model)
+
+
+def assumed_recovery_row() -> Check:
+    """Return the row of a design with a way back to a plant as written that it does not hold."""
+    return information(
+        "plant as written",
+        "elimination, sampling and recovery are those of the plant as written: assumed, as the design does not hold it",
+        np.nan,
+        source="given by hand",
+        status="assumed",
+    )
 
 
 def recovery_as_written_row(derived: StateRecovery, own: StateRecovery) -> Check:

@@ -13,13 +13,14 @@ from obsynth.errors import ObsynthError
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery, unchanged_states
-from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
+from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.plant_source import PlantSource
 from obsynth.verification.plant import (
     DERIVED_TOLERANCE,
     FAMILY_TOLERANCE,
     STORED_TWICE,
+    assumed_recovery_row,
     recovery_as_written_row,
     relative_difference,
 )
@@ -38,14 +39,7 @@ def recursive_plant_rows(design: ObserverDesign) -> Iterator[Check]:
     if back is not None:
         yield _kept_states_row(plant, back)
     if source is None:
-        yield information(
-            "plant as written",
-            "elimination, sampling and recovery are those of the plant as written: assumed, as the design does not "
-            "hold it",
-            np.nan,
-            source="given by hand",
-            status="assumed",
-        )
+        yield assumed_recovery_row()
         return
     try:
         derived = source.derived

@@ -62,7 +62,7 @@ def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: 
     T, N = _constant_gains(plant, noise, sizes)
     errors = _errors(plant, noise, T, N)
     certificate, claim = _certified(errors, sizes, steps)
-    gains = certificate.gains * (plant.count if len(certificate.gains) == 1 else 1)
+    gains = certificate.gains_at_each(plant.count)
     decay = certificate.decay
     used = claim.witness.G is not None or certificate.witness.G is not None
     progress("building the realisation and its certificate")

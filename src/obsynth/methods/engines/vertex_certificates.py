@@ -92,6 +92,10 @@ class VertexCertificate:
     is_negligible: bool = False
     is_fastest: bool = True
 
+    def gains_at_each(self, count: int) -> list[FloatArray]:
+        """Return the gains at each of ``count`` vertices, also where one is for all."""
+        return list(self.gains) * (count if len(self.gains) == 1 else 1)
+
     def gain_times(self, reach: float) -> float:
         """Return the level times a bound ``reach``, rounded up so that the claim covers its own rounding errors."""
         return float(rounded_up(np.asarray(self.level * reach), CLAIM_ROUNDINGS))
@@ -580,7 +584,4 @@ class ErrorUnits:
     def witness_out(self, witness: Witness, level: float) -> Witness:
         """Return Lyapunov matrices in the units of the plant: P of ``e = S e'``, z in units of ``level``, becomes
         ``level ** 2 S^-1 P' S^-1``."""
-        s = self.states / level
-        P = [matrix / s / s[:, None] for matrix in witness.P]
-        G = None if witness.G is None else [matrix / s / s[:, None] for matrix in witness.G]
-        return replace(witness, P=P, G=G, multiplier=witness.multiplier * level**2)
+        return replace(witness.in_units(self.states / level), multiplier=witness.multiplier * level**2)

@@ -43,6 +43,6 @@ def certified_when_centred(
         B=[b - r @ D for b, r in zip(errors.B, R0, strict=True)],
     ).with_innovation(V0)
     found = search(centred)
-    R = found.gains * (errors.count if len(found.gains) == 1 else 1)
+    R = found.gains_at_each(errors.count)
     V = V0 if found.output is None else found.output + V0
     return replace(found, gains=[r + own for r, own in zip(R, R0, strict=True)], output=V)

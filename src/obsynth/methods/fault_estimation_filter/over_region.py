@@ -93,8 +93,7 @@ def _decoupled(
         rest = _certified(made.errors, method, parts, None)
     except SolverError:
         return None
-    Z = rest.gains * (errors.count if len(rest.gains) == 1 else 1)
-    R = [r + z @ made.N.T for r, z in zip(made.R, Z, strict=True)]
+    R = [r + z @ made.N.T for r, z in zip(made.R, rest.gains_at_each(errors.count), strict=True)]
     whole, size = errors.with_innovation(made.V), level_without_gains(ErrorUnits.of(errors).moved(1.0))
     levels = [share * size for share in PROVABLE] if method.gamma is None else [method.gamma / parts.reach]
     for level in levels:
@@ -138,17 +137,14 @@ def _synthesis(
     errors, L0, U2 = errors_over_region(own, W)
     # L0 is that of the pseudoinverse: another W changes R alone.
     weight = W if certificate.output is None else W + certificate.output @ U2.T
-    R = certificate.gains * (errors.count if len(certificate.gains) == 1 else 1)
+    R = certificate.gains_at_each(errors.count)
     states, outputs = (np.ones(1), np.ones(1)) if own is parts else (parts.scaling.states, parts.scaling.outputs)
     L = [states[:, None] * (first + r @ U2.T) * outputs for first, r in zip(L0, R, strict=True)]
     gains: dict[str, FloatArray] = {
         "T": parts.T, "N": parts.N, "W": weight * outputs, "Psi": parts.Psi, "Upsilon": parts.Upsilon
     }  # fmt: skip
     gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
-    witness = certificate.witness
-    P = [matrix / states / states[:, None] for matrix in witness.P]
-    G = None if witness.G is None else [matrix / states / states[:, None] for matrix in witness.G]
-    certificate = replace(certificate, witness=replace(witness, P=P, G=G))
+    certificate = replace(certificate, witness=certificate.witness.in_units(states))
     observer, tracking = _realised(plant, parts, gains, L, certificate.decay)
     matrices = {"tracking": tracking, **stored_witness(certificate.witness)}
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}

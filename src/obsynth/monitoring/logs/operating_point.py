@@ -17,7 +17,7 @@ from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.results.number_texts import number
+from obsynth.results.number_texts import duration, number
 
 #: A signal is far from its operating point when its mean differs by this share of it.
 FAR_FROM_POINT = 0.2
@@ -82,8 +82,6 @@ class OperatingPointCheck:
         lasting = usual * math.log(shares[worst]) / -math.log(SETTLED_TO)
         if not any(event.start < self._begin + lasting for event in alarms):
             return ()
-        from obsynth.results.number_texts import duration
-
         name = plant.output_names[worst]
         is_stated = name in self._signals.point
         where = "its operating point" if is_stated else "zero (no operating point is stated)"

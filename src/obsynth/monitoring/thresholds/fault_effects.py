@@ -28,7 +28,7 @@ from obsynth.monitoring.thresholds.earlier_changes import LOOKED_FOR, EarlierCha
 from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of, ranked
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_levels import HOLD
-from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
+from obsynth.monitoring.thresholds.parameter_scores import parameter_walk, precisions
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.numerics.ranks import DIRECTION_SHARE
@@ -140,20 +140,20 @@ class FaultEffects(ABC):
         spread = np.asarray(observation.parameter_covariance)
         shown = self._shown(state)
         state = state._replace(shown=shown, spread=spread)
-        if not np.isfinite(before.spread).all():
+        known = precisions(before.spread, spread, self.walk, 1)
+        if known is None:
             return state
         is_older = (state.begun < state.row)[:, None, None]
         earlier = np.where(is_older, before.shown, 0.0)
         with np.errstate(all="ignore"):
-            own, prior = np.linalg.inv(spread), np.linalg.inv(before.spread + self.walk)
-            information = 0.5 * (own - prior + (own - prior).T)
+            information = known.added
             units = np.sqrt(np.maximum(np.diag(information), 0.0))
             if not (units > 0.0).all():
                 return state
             sizes, vectors = np.linalg.eigh(information / np.outer(units, units))
             weights = np.where(sizes > DIRECTION_SHARE * sizes[-1], 1.0 / sizes, 0.0)
             inverse = (vectors * weights) @ vectors.T / np.outer(units, units)
-            effects = own @ shown - prior @ earlier
+            effects = known.after @ shown - known.before @ earlier
             rows = state.row - state.begun + 1.0
             counted = (np.isfinite(state.begun) & (rows <= COUNTED))[:, None]
             scored = state.scored + counted * np.einsum("bfh,f->bh", effects, inverse @ away)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -115,19 +115,54 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
     theta, spread = evidence.theta, evidence.parameter_covariance
     after = np.vstack([theta, spread])
     nothing = Scores(np.zeros_like(theta), np.zeros_like(spread), theta, np.sqrt(np.diag(spread)))
-    if not (np.isfinite(before).all() and np.isfinite(after).all()):
+    if not (np.isfinite(before[0]).all() and np.isfinite(theta).all()):
+        return after, nothing
+    known = precisions(before[1:], spread, walk, rows)
+    if known is None or not (np.diag(known.after - known.before) > LEAST_ADDED * np.diag(known.after)).any():
         return after, nothing
     with np.errstate(all="ignore"):
+        score = known.after @ theta - known.before @ before[0]
+    return after, replace(nothing, score=score, information=known.added)
+
+
+class Precisions(NamedTuple):
+    """Inverse covariances ``(nf, nf)`` of parameters before and after a sample, ``M^-1`` and ``P^-1``."""
+
+    before: FloatArray
+    after: FloatArray
+
+    @property
+    def added(self) -> FloatArray:
+        """The information that the sample adds, ``J``."""
+        added = self.after - self.before
+        return np.asarray(0.5 * (added + added.T))
+
+
+def precisions(before: FloatArray, after: FloatArray, walk: FloatArray, rows: int) -> Precisions | None:
+    """Return the precisions of parameters before and after a sample.
+
+    ``None`` where a covariance is not known or singular, or the observer has started again between the samples.
+
+    Parameters
+    ----------
+    before, after : FloatArray
+        Covariances ``(nf, nf)`` after the sample ``rows`` earlier, and after this one.
+    walk : FloatArray
+        Covariance ``(nf, nf)`` of one step of the random walk.
+    rows : int
+        Steps since the earlier sample.
+    """
+    if not (np.isfinite(before).all() and np.isfinite(after).all()):
+        return None
+    with np.errstate(all="ignore"):
         try:
-            own, prior = np.linalg.inv(spread), np.linalg.inv(before[1:] + rows * walk)
+            found = Precisions(*(np.asarray(np.linalg.inv(part)) for part in (before + rows * walk, after)))
         except np.linalg.LinAlgError:
-            return after, nothing
-        added = own - prior
-        score_of_sample = replace(nothing, score=own @ theta - prior @ before[0], information=0.5 * (added + added.T))
+            return None
+        added = found.after - found.before
         # A covariance that grows by more than the walk belongs to an observer that has started again.
-        if not (np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(own)).all()):
-            return after, nothing
-    return after, score_of_sample if (np.diag(added) > LEAST_ADDED * np.diag(own)).any() else nothing
+        has_gone_on = np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(found.after)).all()
+    return found if has_gone_on else None
 
 
 def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
