@@ -60,6 +60,9 @@ WANTED_SHARE = 1e-3
 #: Entries below this share of the largest one count as zero.  SciPy balances the pencil of the Riccati equation, and an
 #: entry of 1e-53 would give states so different units that no digit of the solution is left.
 NO_ENTRY = float(np.finfo(float).eps) ** 2
+#: Directions of smaller covariance, as a share of the largest, count as so large when errors are scaled: coordinates
+#: further apart lose digits.
+LEAST_ERROR_SHARE = 1e-8
 #: A Riccati solution may have negative eigenvalues up to this share of its size, by rounding.
 NEGATIVE_SHARE = 1e-7
 #: Multiples of the least level for which the worst noise is returned: nearer ones give closer bounds, unless rounding
@@ -109,6 +112,15 @@ class LeastEstimation:
     decays: tuple[NDArray[np.complex128], ...]
 
 
+class Searched(NamedTuple):
+    """Gains of a filter and its norm; whether some solutions of Riccati equations gave filters above their level."""
+
+    K: FloatArray
+    Z0: FloatArray
+    level: float
+    is_above_levels: bool = False
+
+
 class Whitened(NamedTuple):
     """A problem in terms of the innovation, without errors that w cannot reach, and its relation to the given one."""
 
@@ -145,9 +157,10 @@ def least_estimation(
         least = _invisible_at(white.plain, angle) if white.noise else limit
         least = max(least, _invisible_from_rest(white.plain))
         level = _norm(_error_system(core, K, Z0))
-        better = _search(core, (K, Z0), least, level)
-        if better is not None:
-            K, Z0, level = better
+        found = _search(core, (K, Z0), least, level)
+        if found.is_above_levels:
+            white, found = _searched_in_units_of_errors(white, P0, found, least)
+        (K, Z0, level, _), core = found, white.problem
         decays = tuple(_decays(core, share * level) for share in WORST_LEVELS)
     closed = _error_system(white.plain, K, Z0)
     gain = _norm(closed) if norm == "hinf" else _deviation(closed)
@@ -366,28 +379,49 @@ def _at_level(problem: EstimationProblem, level: float) -> tuple[FloatArray, flo
     return (P, -largest / level**2) if np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0 else None
 
 
-def _search(
-    problem: EstimationProblem, first: tuple[FloatArray, FloatArray], least: float, high: float
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """Search the level between a lower bound and the norm of the H2 filter; a level counts as the true norm says."""
+def _searched_in_units_of_errors(
+    white: Whitened, covariance: FloatArray, found: Searched, least: float
+) -> tuple[Whitened, Searched]:
+    """Search on in coordinates in which the least covariance of the errors is the identity.
+
+    At the levels of filters Riccati equations have solutions near it, or above.  In other coordinates their rounding
+    may make the gain of a filter of 100 states a thousandth larger than the least one.  Return the coordinates in
+    which the better filter was found, and that filter.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    if not len(values) or not values[-1] > 0.0:
+        return white, found
+    sizes = np.sqrt(np.maximum(values, LEAST_ERROR_SHARE * values[-1]))
+    onto, back = (vectors / sizes).T, vectors * sizes
+
+    def turned(problem: EstimationProblem) -> EstimationProblem:
+        return replace(problem, A=onto @ problem.A @ back, B=onto @ problem.B, C=problem.C @ back, L=problem.L @ back)
+
+    scaled = white._replace(problem=turned(white.problem), plain=turned(white.plain), basis=white.basis @ back)
+    again = _search(scaled.problem, (onto @ found.K, found.Z0), least, found.level)
+    return (scaled, again) if again.level < found.level else (white, found)
+
+
+def _search(problem: EstimationProblem, first: tuple[FloatArray, FloatArray], least: float, high: float) -> Searched:
+    """Search the level between a lower bound and the norm of the first filter; a level counts as the true norm says."""
     nothing = ZERO_SHARE * max(float(np.linalg.norm(problem.D1)), float(np.linalg.norm(problem.L @ problem.B)), high)
     if high <= max(least * (1.0 + LEVEL_SHARE), nothing):
-        return None
-    low, best = least * (1.0 - BOUND_ROUNDING), None
+        return Searched(*first, high)
+    low, best, is_above = least * (1.0 - BOUND_ROUNDING), first, False
     level, reached, failed = least * (1.0 + 3.0 * LEVEL_SHARE), list[tuple[float, float]](), 0
     for _ in range(MOST_LEVELS):
         level = level if low < level < high else 0.5 * (low + high)
         solved = _at_level(problem, level)
         gains = None if solved is None else _central(problem, solved[0])
         if solved is None or gains is None or _norm(_error_system(problem, *gains)) > level * (1.0 + NORM_ABOVE_LEVEL):
-            low, failed = level, failed + 1
+            low, failed, is_above = level, failed + 1, is_above or gains is not None
         else:
             high, best, failed = level, gains, 0
             reached = [*reached[-2:], (float(level**2), float(solved[1] * level**2))]
         if high - low <= LEVEL_SHARE * high or high <= nothing:
             break
         level = _next_level(reached, low, high, failed)
-    return None if best is None else (*best, high)
+    return Searched(*best, high, is_above)
 
 
 def _next_level(reached: list[tuple[float, float]], low: float, high: float, failed: int) -> float:

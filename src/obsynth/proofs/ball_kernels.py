@@ -11,7 +11,9 @@ import scipy.linalg
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.complex_balls import columns_of, scaled_columns, zeros
+from obsynth.proofs.enclosed_solutions import enclosed_solution
 
 #: Columns of signals that are smaller beside the others, in double precision, are left out.
 DEPENDENT_SHARE = 1e-12
@@ -60,9 +62,16 @@ def pivots_of(matrix: Any) -> tuple[list[int], list[int]]:
     return [int(i) for i in order[: len(matrix)]], [int(i) for i in order[len(matrix) :]]
 
 
-def solution_with_free(matrix: Any, pivots: Sequence[int], others: Sequence[int], free: Any) -> Any:
-    """Return the solution of the equations whose free entries are given, a column."""
-    solved = columns_of(matrix, pivots).solve(-(columns_of(matrix, others) * free))
+def solution_with_free(
+    matrix: Any, nearby: Sequence[Ball], pivots: Sequence[int], others: Sequence[int], free: Any
+) -> Any:
+    """Return the solution of homogeneous equations whose free entries are given, a column.
+
+    ``nearby`` are the pivots' columns in double precision with their rounding: the real part, and the imaginary one if
+    there is any.
+    """
+    right = -(columns_of(matrix, others) * free)
+    solved = enclosed_solution(columns_of(matrix, pivots), right, nearby)
     entries = dict(zip([*pivots, *others], [*solved.entries(), *free.entries()], strict=True))
     return type(matrix)(len(entries), 1, [entries[place] for place in range(len(entries))])
 

@@ -14,8 +14,8 @@ from obsynth.proofs.extended_balls import ExtendedBall, arb_matrix, block, middl
 from obsynth.proofs.regular_pencils import distance_from_circle
 from obsynth.verification.inequalities import NO_GAIN, System
 
-#: States of a system whose pencil is proved to be regular: half a second at 60.
-MOST_STATES_OF_PENCILS = 100
+#: States of a system whose pencil is proved to be regular: half a second at 60, three at 105.
+MOST_STATES_OF_PENCILS = 150
 
 #: Digits, in bits, in which it is formed: rounding is far below that of its vectors, which are in double precision.
 PENCIL_BITS = 128

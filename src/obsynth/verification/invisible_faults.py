@@ -26,6 +26,7 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.ball_kernels import independent_columns, pivots_of, solution_with_free, solution_with_one_free
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.complex_balls import (
     adjoint,
     beside,
@@ -38,6 +39,7 @@ from obsynth.proofs.complex_balls import (
     scaled_columns,
     zeros,
 )
+from obsynth.proofs.enclosed_solutions import enclosed_solution
 from obsynth.verification.energy_ratios import worst_ratio
 from obsynth.verification.seen_outputs import (
     Faint,
@@ -190,6 +192,12 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
     return None
 
 
+def _in_doubles(still: FloatArray, moved: FloatArray, point: complex, columns: Sequence[int]) -> list[Ball]:
+    """Return real and imaginary part of columns of a pencil at a point, in double precision with their rounding."""
+    fixed, rate = Ball.exact(still[:, columns]), Ball.exact(moved[:, columns])
+    return [fixed + rate.scaled(point.real), rate.scaled(point.imag)]
+
+
 def _grows(point: Any, plant: DescriptorSystem) -> bool:
     """Whether the signals of a point, a complex ball, end with finite energy now: it is outside, or on the right."""
     return bool(point.abs_lower() > 1 if plant.is_discrete else point.real > 0)
@@ -247,8 +255,10 @@ class _Trajectories:
             return [zero] if _grows(zero.point, plant) else []
         pivots, others = pivots_of(still + point * moved)
         exact = complex_matrix(still + 0j) + complex_matrix(moved + 0j) * flint.acb(point)
-        solved = columns_of(exact, pivots).solve(-columns_of(exact, others))
-        vectors = [solution_with_one_free(solved, pivots, others, j) for j in range(free)]
+        regular = enclosed_solution(
+            columns_of(exact, pivots), -columns_of(exact, others), _in_doubles(still, moved, point, pivots)
+        )
+        vectors = [solution_with_one_free(regular, pivots, others, j) for j in range(free)]
         # Unknown inputs alone may be invisible too, of which neither error nor noise is anything.
         nh, nw = self.Bh.shape[1], self.Bw.shape[1]
         counted = [*range(nx, nx + (plant.nf if self.setting.exact else 0)), *range(nx + nh, nx + nh + nw)]
@@ -258,12 +268,13 @@ class _Trajectories:
         """Return the signal of a point with these free entries, and its conjugate."""
         still, moved = invisible_pencil(self.plant, np.hstack([self.Bh, self.Bw]), np.hstack([self.Dh, self.Dw]))
         pivots, others = pivots_of(still + point * moved)
+        nearby = _in_doubles(still, moved, point, pivots)
         if point.imag:
             exact = complex_matrix(still + 0j) + complex_matrix(moved + 0j) * flint.acb(point)
-            vector = solution_with_free(exact, pivots, others, complex_matrix(free[:, None]))
+            vector = solution_with_free(exact, nearby, pivots, others, complex_matrix(free[:, None]))
             return [_Member(flint.acb(point), vector), _Member(flint.acb(point.conjugate()), vector.conjugate())]
         exact = real_matrix(still) + real_matrix(moved) * flint.arb(point.real)
-        vector = solution_with_free(exact, pivots, others, real_matrix(free.real[:, None]))
+        vector = solution_with_free(exact, nearby[:1], pivots, others, real_matrix(free.real[:, None]))
         return [_Member(flint.acb(point.real), flint.acb_mat(vector))]
 
     def _part(self, which: str) -> Any:

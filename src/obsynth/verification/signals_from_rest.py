@@ -18,6 +18,7 @@ from obsynth.proofs.ball_kernels import (
     solution_with_free,
     solution_with_one_free,
 )
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.complex_balls import beside, columns_of, complex_matrix, real_matrix, rows_of, stacked, zeros
 
 
@@ -53,7 +54,10 @@ def signals_from_rest(
     """
     system, places = equations_from_rest(plant, hidden, noise, samples)
     if free is not None:
-        one = flint.acb_mat(solution_with_free(real_matrix(system), *pivots_of(system), real_matrix(free[:, None])))
+        pivots, others = pivots_of(system)
+        nearby = [Ball.exact(system[:, pivots])]
+        given = real_matrix(free[:, None])
+        one = flint.acb_mat(solution_with_free(real_matrix(system), nearby, pivots, others, given))
         return [rows_of(one, place) for place in places], _states_of(one, places, plant)
     try:
         pivots, others = pivots_of(system)
